@@ -1,0 +1,22 @@
+"""The words that options take: one table for the code and for the command line.
+
+It imports nothing heavy, so that ``--help`` answers at once.
+"""
+
+from typing import Literal, get_args
+
+Estimator = Literal["minmax"]
+Fill = Literal["inpaint", "lit", "none"]
+Format = Literal["exr", "png"]
+Missing = Literal["error", "skip"]
+Only = Literal["trimap", "alpha", "beta"]
+TransferName = Literal["auto", "linear", "srgb", "rec709", "none"]
+Progress = Literal["auto", "bar", "plain", "openjd", "none"]
+
+ESTIMATORS: tuple[str, ...] = get_args(Estimator)
+FILLS: tuple[str, ...] = get_args(Fill)
+FORMATS: tuple[str, ...] = get_args(Format)
+MISSING: tuple[str, ...] = get_args(Missing)
+ONLY: tuple[str, ...] = get_args(Only)
+TRANSFER_NAMES: tuple[str, ...] = get_args(TransferName)
+PROGRESS: tuple[str, ...] = get_args(Progress)

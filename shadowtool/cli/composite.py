@@ -1,0 +1,47 @@
+"""``shadowtool composite``."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from shadowtool.choices import FILLS, FORMATS
+from shadowtool.cli.options import folder_option, step_command
+
+
+@click.command()
+@click.argument("mattes", metavar="[MATTE]", required=False, type=click.Path(path_type=Path))
+@folder_option("--plates", "plates", "Plates of the target scene.", required=True)
+@click.option(
+    "--warp",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="ST map from warp; without it the shadow stays as it fell in the source.",
+)
+@click.option("--fg", "foreground", metavar="FRAMES", help="Figure frames instead of MATTE/fg.")
+@click.option("--beta-frames", "beta", metavar="FRAMES", help="β frames instead of MATTE/beta.")
+@click.option("--ratio", is_flag=True, help="Write ratio/ too: multiply by it to cast the shadow.")
+@click.option(
+    "--fill",
+    type=click.Choice(FILLS),
+    default="lit",
+    show_default=True,
+    help="What β becomes where it is unknown (NaN).",
+)
+@click.option(
+    "--format",
+    "file_format",
+    type=click.Choice(FORMATS),
+    default="exr",
+    show_default=True,
+    help="exr: linear half. png: 16 bit, sRGB-encoded.",
+)
+@step_command
+def command(mattes: Path | None, output: Path, **options: Any) -> list[Any]:
+    """Put the figure and its shadow into the target scene.
+
+    MATTE is a folder written by matte. Each pixel becomes αF + (1 - α)(βL' + (1 - β)S').
+    """
+    from shadowtool.steps.composite import composite
+
+    return [composite(mattes, output, **options)]

@@ -1,0 +1,130 @@
+"""Each shared option, once."""
+
+import functools
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from shadowtool.choices import MISSING, PROGRESS, TRANSFER_NAMES
+from shadowtool.cli.progress import reporter
+from shadowtool.cli.report import report
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+output_option = click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="DIR",
+    help="Folder to write to; made if it isn't there.",
+)
+frames_option = click.option(
+    "--frames", metavar="RANGE", help="Frames to work on: 1001-1048, 1001-1048x2, 1,5,9-20."
+)
+missing_option = click.option(
+    "--missing",
+    type=click.Choice(MISSING),
+    default="error",
+    show_default=True,
+    help="What to do about frames that are absent or damaged; after skipping the exit code is 3.",
+)
+jobs_option = click.option(
+    "-j",
+    "--jobs",
+    type=click.IntRange(min=1, max=1024),
+    metavar="N",
+    help="Threads. Default: the CPUs that the process may use, or SLURM_CPUS_PER_TASK.",
+)
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace what is there.")
+resume_option = click.option(
+    "--resume", is_flag=True, help="Keep what is there, whole and up to date; make the rest."
+)
+progress_option = click.option(
+    "--progress",
+    type=click.Choice(PROGRESS),
+    default="auto",
+    show_default=True,
+    help="On stderr. auto: a bar on a terminal, plain lines in a log.",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+verbose_option = click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
+quiet_option = click.option(
+    "-q", "--quiet", is_flag=True, help="Say nothing but errors, print no result."
+)
+transfer_option = click.option(
+    "--transfer",
+    type=click.Choice(TRANSFER_NAMES),
+    default="auto",
+    show_default=True,
+    help="How code values stand for light. auto: EXR linear, PNG sRGB, movies as they say or"
+    " Rec.709. none: use code values as they are.",
+)
+
+
+def folder_option(
+    name: str, parameter: str, help_text: str, required: bool = False
+) -> Callable[[Function], Function]:
+    """An option that takes a folder."""
+    return click.option(
+        name,
+        parameter,
+        type=click.Path(path_type=Path),
+        metavar="DIR",
+        required=required,
+        help=help_text,
+    )
+
+
+def step_command(function: Function) -> Function:
+    """What every command has: -o, --frames, --jobs and the others; reports the step's result.
+
+    The decorated function gets ``output`` and ``run`` beside its own options and returns the
+    results to report, in order.
+    """
+
+    @functools.wraps(function)
+    def wrapper(
+        *,
+        frames: str | None,
+        missing: str,
+        jobs: int | None,
+        overwrite: bool,
+        resume: bool,
+        progress: str,
+        as_json: bool,
+        verbose: bool,
+        quiet: bool,
+        **others: Any,
+    ) -> int:
+        if overwrite and resume:
+            raise click.UsageError("--overwrite and --resume exclude each other")
+        level = logging.ERROR if quiet else logging.DEBUG if verbose else logging.WARNING
+        logging.getLogger().setLevel(level)
+        from shadowtool.steps.run import Run
+
+        name = click.get_current_context().info_name or ""
+        with reporter(progress if not quiet else "none", name) as advance:
+            run = Run(frames, missing, jobs, overwrite, resume, advance)  # type: ignore[arg-type]
+            results = function(run=run, **others)
+        if not quiet:
+            report(results, as_json)
+        return 3 if any(result.skipped for result in results) else 0
+
+    for option in (
+        quiet_option,
+        verbose_option,
+        json_option,
+        progress_option,
+        resume_option,
+        overwrite_option,
+        jobs_option,
+        missing_option,
+        frames_option,
+        output_option,
+    ):
+        wrapper = option(wrapper)
+    return wrapper  # type: ignore[return-value]

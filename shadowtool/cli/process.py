@@ -1,0 +1,100 @@
+"""The program as a process: signals, streams, exit codes."""
+
+import contextlib
+import io
+import logging
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from types import FrameType
+from typing import NoReturn
+
+import click
+
+from shadowtool.cli.commands import shadowtool
+from shadowtool.errors import ShadowtoolError
+
+SKIPPED, INTERRUPTED, TERMINATED = 3, 130, 143
+
+
+class _Terminated(BaseException):
+    """SIGTERM arrived."""
+
+
+def run_process() -> NoReturn:
+    """Run the command line of this process and end it with its exit code."""
+    signal.signal(signal.SIGTERM, _terminate)
+    if "-v" not in sys.argv and "--verbose" not in sys.argv:
+        _silence_libraries()
+    code = run_command(sys.argv[1:])
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    # Not sys.exit: a reader that closed our pipe would make the interpreter complain at its end.
+    os._exit(code)
+
+
+def run_command(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code; messages go to stderr."""
+    logging.basicConfig(format="shadowtool: %(message)s", stream=sys.stderr, force=True)
+    try:
+        code = shadowtool.main(list(arguments), "shadowtool", standalone_mode=False)
+        return code if isinstance(code, int) else 0
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except ShadowtoolError as error:
+        _say(str(error))
+        return error.exit_code
+    except (KeyboardInterrupt, click.Abort):
+        _say("interrupted; finished frames are whole, --resume goes on from here")
+        return INTERRUPTED
+    except _Terminated:
+        _say("terminated; finished frames are whole, --resume goes on from here")
+        return TERMINATED
+    except BrokenPipeError:
+        return 1
+    except MemoryError:
+        _say("out of memory; give a smaller --jobs or run on a larger machine")
+        return 75
+    except Exception as error:
+        if logging.getLogger().isEnabledFor(logging.DEBUG):
+            traceback.print_exc()
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        _say(
+            f"a fault of shadowtool's own: {type(error).__name__}: {error}"
+            f" ({os.path.basename(place.filename)}:{place.lineno}); -v shows where"  # noqa: PTH119
+        )
+        return 1
+
+
+def _say(message: str) -> None:
+    line = " ".join(message.split("\n"))
+    with contextlib.suppress(OSError):
+        print(f"shadowtool: error: {line}", file=sys.stderr, flush=True)
+
+
+def _terminate(number: int, frame: FrameType | None) -> NoReturn:
+    raise _Terminated
+
+
+def _silence_libraries() -> None:
+    """Keep what C libraries print to stdout and stderr from getting between our lines.
+
+    OpenEXR writes a warning to stdout for a damaged file, which is then reported by us; stdout
+    holds only results. ``-v`` leaves everything as it is.
+    """
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        try:
+            kept = os.dup(number)
+        except OSError:
+            continue
+        stream = io.TextIOWrapper(
+            os.fdopen(kept, "wb"), errors="backslashreplace", write_through=True
+        )
+        setattr(sys, name, stream)
+        os.dup2(nowhere, number)
+    os.close(nowhere)

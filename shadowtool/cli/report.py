@@ -1,0 +1,54 @@
+"""A step's result on stdout, as text or JSON."""
+
+import json
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from shadowtool.steps.run import Result
+
+
+def report(results: Iterable["Result"], as_json: bool) -> None:
+    """Print what the steps did."""
+    rows = [_row(result) for result in results]
+    if as_json:
+        click.echo(json.dumps(rows[0] if len(rows) == 1 else rows, indent=1, sort_keys=True))
+        return
+    for row in rows:
+        click.echo(_headline(row))
+        for name, value in row["figures"].items():
+            click.echo(f"  {name.replace('_', ' ')}: {_text(value)}")
+
+
+def _row(result: "Result") -> dict[str, Any]:
+    from shadowtool.io.sequence import frame_range
+
+    return {
+        "step": result.step,
+        "output": str(result.output),
+        "frames": frame_range(result.frames) if result.frames else "",
+        "kept": result.kept,
+        "skipped": frame_range(result.skipped) if result.skipped else "",
+        "figures": result.figures,
+    }
+
+
+def _headline(row: dict[str, Any]) -> str:
+    parts = [f"{row['step']}: {row['output']}"]
+    if row["frames"]:
+        parts.append(f"frames {row['frames']}")
+    if row["kept"]:
+        parts.append(f"{row['kept']} up to date")
+    if row["skipped"]:
+        parts.append(f"SKIPPED {row['skipped']}")
+    return ", ".join(parts)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in value.items())
+    if isinstance(value, list):
+        return ", ".join(map(_text, value)) or "none"
+    return "unknown" if value is None else str(value)

@@ -1,0 +1,1 @@
+"""The paper's ideas, one module each: arrays in, arrays out."""

@@ -1,0 +1,141 @@
+"""The shadow matte β: how much of the key light reaches each pixel (section 2)."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.choices import Fill
+from shadowtool.core.noise import NoiseModel, extreme_range
+from shadowtool.core.plates import Plates
+
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+# A hole of more than this part of the frame is no hole but a region that the shadow never reached.
+_LARGEST_HOLE = 0.005
+
+
+def shadow_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> Float32:
+    """Visibility of the key light by projection onto the line from S to L.
+
+    Eq. (5) of Chuang et al. 2003: β = (C - S)·(L - S) / ‖L - S‖².
+
+    Args:
+        image, lit, shadow: (H, W, 3), linear light.
+
+    Returns:
+        (H, W) float32, not clipped; NaN where L = S in all channels or anything is NaN.
+    """
+    image = image.astype(np.float32, copy=False)
+    above_red, above_green, above_blue = (image[..., c] - shadow[..., c] for c in range(3))
+    range_red, range_green, range_blue = (lit[..., c] - shadow[..., c] for c in range(3))
+    projection = above_red * range_red + above_green * range_green + above_blue * range_blue
+    length = range_red**2 + range_green**2 + range_blue**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        beta = projection / length
+    beta[~(length > 0)] = np.nan
+    return np.asarray(beta, np.float32)
+
+
+def shadow_contrast(plates: Plates, noise: NoiseModel) -> Float32:
+    """How far L and S lie apart, in standard deviations of the noise that β sees there.
+
+    1 / contrast is the standard error of Eq. (5)'s β from noise in C at mid shadow: the noise
+    projected onto the line, over the line's length.
+
+    Returns:
+        (H, W) float32 ≥ 0; NaN where a plate is.
+    """
+    span = plates.lit - plates.shadow
+    sigma = noise.sigma((plates.lit + plates.shadow) / 2)
+    length2 = (span**2).sum(axis=-1)
+    projected = np.sqrt((span**2 * sigma**2).sum(axis=-1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        contrast = length2 / projected
+    contrast[length2 == 0] = 0
+    return np.asarray(contrast, np.float32)
+
+
+def unknown_beta(contrast: Float32, frames: NDArray[np.uint32] | None) -> Bool:
+    """Where L and S do not differ by more than the noise, so that β can't be known.
+
+    Args:
+        contrast: (H, W) from `shadow_contrast`.
+        frames: (H, W), how many frames the extremes were taken of; None for plates without noise
+            of their own.
+
+    Returns:
+        (H, W) bool, true where the contrast is NaN too.
+    """
+    least = np.float32(8) if frames is None else np.maximum(extreme_range(frames), 8)
+    return ~(contrast > least)
+
+
+def fill_beta(beta: Float32, never_shaded: Bool, hidden: Bool, fill: Fill) -> Float32:
+    """Give unknown pixels a value.
+
+    With ``lit`` they become 1. With ``inpaint`` small unknown patches and what the figure hides
+    are continued from around them (Telea's method), and large regions that the shadow never
+    reached in the whole take become 1: nothing there is in shadow in this frame either. With
+    ``none`` they stay NaN.
+
+    Args:
+        beta: (H, W) float32 in [0, 1] or NaN.
+        never_shaded: (H, W), no difference between L and S.
+        hidden: (H, W), the figure is in front.
+
+    Returns:
+        (H, W) float32, a new array.
+    """
+    filled = beta.copy()
+    if fill == "none":
+        return filled
+    if fill == "lit":
+        filled[np.isnan(filled)] = 1
+        return filled
+    filled[never_shaded & ~_small(never_shaded)] = 1
+    # A pixel that was never shaded is no source to continue a shadow from only where it is itself
+    # unknown; where it was set to 1 above it is as good as measured.
+    filled[hidden] = np.nan
+    return inpaint(filled)
+
+
+def inpaint(image: Float32) -> Float32:
+    """Continue an image smoothly into its NaN pixels; all 1 if nothing is known.
+
+    Args:
+        image: (H, W) float32.
+
+    Returns:
+        (H, W) float32 without NaN, known pixels unchanged.
+    """
+    holes = np.isnan(image)
+    if not holes.any():
+        return image
+    if holes.all():
+        return np.ones_like(image)
+    filled = np.where(holes, np.float32(0), image)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8))
+    height, width = image.shape
+    margin = 6
+    for label in range(1, count):
+        x, y, w, h, _ = boxes[label]
+        rows = slice(max(y - margin, 0), min(y + h + margin, height))
+        columns = slice(max(x - margin, 0), min(x + w + margin, width))
+        patch = np.ascontiguousarray(filled[rows, columns])
+        # Other holes in the patch are holes here too: their zeros are no values.
+        mask = np.ascontiguousarray(holes[rows, columns]).astype(np.uint8)
+        if mask.all():
+            continue
+        own = labels[rows, columns] == label
+        filled[rows, columns][own] = cv2.inpaint(patch, mask, 3, cv2.INPAINT_TELEA)[own]
+    low, high = np.nanmin(image), np.nanmax(image)
+    return np.where(holes, np.clip(filled, low, high), image).astype(np.float32)
+
+
+def _small(mask: Bool) -> Bool:
+    """The connected parts of a mask that are small enough to be called holes."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    small = stats[:, cv2.CC_STAT_AREA] <= _LARGEST_HOLE * mask.size
+    small[0] = False
+    return np.asarray(small[labels])

@@ -1,0 +1,44 @@
+"""Putting shadow and figure into the target scene (section 3)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+
+def shade(lit: Float32, shadow: Float32, beta: Float32) -> Float32:
+    """The background under a shadow, Eqs. (3) and (6): C' = βL' + (1 - β)S'.
+
+    Args:
+        lit, shadow: (H, W, 3) float32, linear light.
+        beta: (H, W), or (H, W, 3) for coloured light; not limited to [0, 1].
+
+    Returns:
+        (H, W, 3) float32; exactly L' where β = 1 and S' where β = 0; NaN where an input is.
+    """
+    visibility = beta if beta.ndim == 3 else beta[..., None]
+    result = visibility * lit
+    result += (1 - visibility) * shadow
+    return result
+
+
+def over(foreground: Float32, alpha: Float32, background: Float32) -> Float32:
+    """A premultiplied figure over a background, Eq. (1): C = αF + (1 - α)B.
+
+    Args:
+        foreground: (H, W, 3), premultiplied, linear light.
+        alpha: (H, W) in [0, 1].
+        background: (H, W, 3).
+    """
+    return foreground + (1 - alpha[..., None]) * background
+
+
+def shadow_ratio(shaded: Float32, lit: Float32) -> Float32:
+    """What the lit plate is to be multiplied by to be in shadow: C'/L'.
+
+    Returns:
+        (H, W, 3) float32, 1 where the lit plate is black.
+    """
+    ratio = np.ones_like(shaded)
+    np.divide(shaded, lit, out=ratio, where=lit > 0)
+    return ratio

@@ -1,0 +1,209 @@
+"""The camera's noise against brightness, measured from a take.
+
+Photon and read noise: the variance of a channel is ``slope * value + floor`` in linear light.
+Both are found from differences between frames of a static camera, where motion is a minority that
+a robust spread ignores.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# 70% of the |x| of a standard normal x lie below this. The median would bear more motion, but a
+# compressed movie repeats half of its pixels from frame to frame.
+_QUANTILE, _QUANTILE_SIGMA = 0.7, 1.0364334
+_LEVELS = 12
+_GRID = 10_000
+_SAMPLES = 8
+# Of frames far apart, this part of the pairs may be spoilt by something large that moved.
+_FAR_QUANTILE = 0.25
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variance = slope * value + floor, per channel, linear light.
+
+    Attributes:
+        slope, floor: (3,) float64, non-negative.
+    """
+
+    slope: Float64
+    floor: Float64
+
+    def sigma(self, image: NDArray[np.floating]) -> Float32:
+        """Standard deviation of the noise at these values.
+
+        Args:
+            image: (..., 3), linear light; negative values count as 0; NaN gives NaN.
+
+        Returns:
+            (..., 3) float32, above 0 wherever ``floor`` is.
+        """
+        variance = np.maximum(image, 0) * self.slope + self.floor
+        return np.asarray(np.sqrt(variance), np.float32)
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """One step of the measured curve: the noise of one channel at one brightness."""
+
+    channel: int
+    value: float
+    sigma: float
+
+
+def sample_positions(frames: int) -> dict[int, int]:
+    """Which frames of a take to measure its noise in.
+
+    Args:
+        frames: their number.
+
+    Returns:
+        Position of a frame by a running number; evenly spread neighbours, 2k and 2k + 1 a pair.
+        Empty if there are fewer than two frames.
+    """
+    if frames < 2:
+        return {}
+    starts = np.unique(np.linspace(0, frames - 2, _SAMPLES).astype(int))
+    return {2 * k + i: int(start) + i for k, start in enumerate(starts) for i in (0, 1)}
+
+
+def thin(image: NDArray[np.floating]) -> Float32:
+    """The fixed grid of about 10,000 pixels, (P, 3), of a frame (H, W, 3) that is looked at."""
+    step = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / _GRID)))
+    return image[::step, ::step].reshape(-1, 3).astype(np.float32)
+
+
+class NoiseSamples:
+    """Keeps evenly spread pairs of a take whose length is not known beforehand.
+
+    Whenever there are twice too many, every other pair is dropped; memory stays bounded.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[int, dict[int, Float32]] = {}
+        self._every = 2
+        self._count = 0
+
+    def add(self, image: NDArray[np.floating]) -> None:
+        """Take in the next frame, (H, W, 3) linear light."""
+        start, place = divmod(self._count, self._every)
+        if place < 2:
+            self._kept.setdefault(start * self._every, {})[place] = thin(image)
+        self._count += 1
+        if len(self._kept) > 2 * _SAMPLES and place == 1:
+            self._every *= 2
+            self._kept = {s: pair for s, pair in self._kept.items() if s % self._every == 0}
+
+    def samples(self) -> dict[int, Float32]:
+        """What was kept, numbered as `noise_levels` takes it."""
+        pairs = enumerate(self._kept[start] for start in sorted(self._kept))
+        return {2 * k + place: image for k, pair in pairs for place, image in pair.items()}
+
+
+def noise_levels(samples: Mapping[int, NDArray[np.floating]]) -> list[NoiseLevel]:
+    """The noise against brightness.
+
+    Neighbouring frames tell sensor noise; frames far apart tell besides what a codec hides, which
+    repeats a pixel's noise until it sends the pixel anew. The larger counts.
+
+    Args:
+        samples: thinned frames under the running numbers of `sample_positions`; any may be absent.
+
+    Returns:
+        Dark to bright, each channel in turn; empty where no two frames can be compared.
+    """
+    near = [(a, a + 1) for a in samples if a % 2 == 0 and a + 1 in samples]
+    firsts = sorted(a for a in samples if a % 2 == 0)
+    far = [(a, b) for a, b in combinations(firsts, 2) if b - a >= len(firsts) // 2]
+    measured = [
+        np.quantile(rows, part, axis=0)
+        for pairs, part in ((near, 0.5), (far, _FAR_QUANTILE))
+        if (rows := _spreads([(samples[a], samples[b]) for a, b in pairs]))
+    ]
+    if not measured:
+        return []
+    values = measured[0][0]
+    sigmas = np.max([row[1] for row in measured], axis=0)
+    return [
+        NoiseLevel(channel, float(values[level, channel]), float(sigmas[level, channel]))
+        for channel in range(3)
+        for level in range(_LEVELS)
+    ]
+
+
+def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
+    """The line through the measured variances.
+
+    Args:
+        levels: from `noise_levels`; empty gives a model of ``least`` alone.
+        least: noise that is always assumed, linear light: about what storing as half floats adds,
+            and something to compare a rendering with.
+    """
+    slope, floor = np.zeros(3), np.zeros(3)
+    for channel in range(3):
+        own = [level for level in levels if level.channel == channel]
+        if own:
+            values = np.array([max(level.value, 0.0) for level in own])
+            variances = np.array([level.sigma**2 for level in own])
+            slope[channel], floor[channel] = _non_negative_line(values, variances)
+    return NoiseModel(slope, np.maximum(floor, least**2))
+
+
+def _spreads(pairs: list[tuple[NDArray[np.floating], NDArray[np.floating]]]) -> list[Float64]:
+    """For each pair of thinned frames (2, levels, 3): brightness and standard deviation."""
+    spreads = []
+    for first, second in pairs:
+        usable = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+        if usable.sum() < 4 * _LEVELS:
+            continue
+        # By the brighter of the two: a pixel that the shadow covers in one of them alone, which
+        # says nothing of the noise, is then among the lit ones, where it is in the minority.
+        level_of = np.maximum(first[usable], second[usable])
+        difference = np.abs(first[usable] - second[usable])
+        spread = np.empty((2, _LEVELS, 3))
+        for channel in range(3):
+            order = np.argsort(level_of[:, channel], kind="stable")
+            for level, part in enumerate(np.array_split(order, _LEVELS)):
+                spread[0, level, channel] = np.median(level_of[part, channel])
+                # The variance of a difference is twice that of one frame.
+                wide = np.quantile(difference[part, channel], _QUANTILE)
+                spread[1, level, channel] = wide / _QUANTILE_SIGMA / np.sqrt(2)
+        spreads.append(spread)
+    return spreads
+
+
+def _non_negative_line(x: Float64, y: Float64) -> tuple[float, float]:
+    """Slope and intercept >= 0 of y over x, each point weighted by the inverse of its value."""
+    weight = 1 / np.maximum(y, max(float(y.max()) * 1e-2, 1e-20)) ** 2
+    sw, sx, sy = weight.sum(), (weight * x).sum(), (weight * y).sum()
+    sxx, sxy = (weight * x * x).sum(), (weight * x * y).sum()
+    determinant = sw * sxx - sx * sx
+    if determinant > 1e-12 * sw * sxx:
+        slope = (sw * sxy - sx * sy) / determinant
+        floor = (sxx * sy - sx * sxy) / determinant
+        if slope >= 0 and floor >= 0:
+            return float(slope), float(floor)
+        if floor < 0 and sxx > 0:
+            return float(sxy / sxx), 0.0
+    return 0.0, float(sy / sw)
+
+
+def extreme_range(frames: NDArray[np.integer] | int) -> Float32:
+    """How far maximum and minimum of pure noise lie apart, in standard deviations.
+
+    Args:
+        frames: how many samples were looked at, any shape.
+
+    Returns:
+        An upper estimate of the range of that many normal samples, 2·sqrt(2·ln n) with three
+        standard deviations of the range on top; float32, the shape of ``frames``.
+    """
+    count = np.maximum(np.asarray(frames, np.float32), 1)
+    return np.asarray(2 * np.sqrt(2 * np.log(count)) + 3, np.float32)

@@ -1,0 +1,113 @@
+"""Pictures to judge a scan and a warp map by, on set and in reports."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.shadow_lines import ShadowLines
+from shadowtool.core.transfer import encode_srgb
+from shadowtool.core.warp_map import WarpMap, identity_map
+
+Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
+
+_GREEN, _RED, _BLUE = (60, 230, 90), (255, 70, 50), (90, 150, 255)
+# Sub-pixel drawing: OpenCV's fixed-point coordinates.
+_SHIFT = 4
+
+
+def time_picture(
+    image: NDArray[np.floating],
+    time: Float32,
+    lines: ShadowLines,
+    plane: NDArray[np.bool_] | None = None,
+    every: int = 5,
+) -> UInt8:
+    """Shadow times as coloured bands over a frame, with fitted lines and the plane's outline.
+
+    Args:
+        image: (H, W, 3) linear light.
+        time: (H, W), NaN unknown.
+        lines: fitted lines are drawn green, replaced ones red.
+        plane: (H, W), outlined in blue.
+        every: draw the line of every so many frames.
+
+    Returns:
+        (H, W, 3) uint8 RGB, sRGB-encoded.
+    """
+    canvas = _dimmed(image)
+    known = np.isfinite(time)
+    if known.any():
+        low, high = float(np.min(time[known])), float(np.max(time[known]))
+        scaled = (np.nan_to_num(time, nan=low) - low) / max(high - low, 1e-6)
+        colours = _colours(scaled)
+        # A saw-tooth every few frames makes isolines visible.
+        phase = np.nan_to_num(np.mod(time, every), nan=0.0) / every
+        strength = (known * (0.35 + 0.3 * phase)).astype(np.float32)[..., None]
+        canvas = (canvas * (1 - strength) + colours * strength).astype(np.uint8)
+    if plane is not None:
+        outline, _ = cv2.findContours(
+            plane.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        )
+        cv2.drawContours(canvas, outline, -1, _BLUE, 1, cv2.LINE_AA)
+    for index in range(0, len(lines), every):
+        colour = _RED if lines.origin[index] == "interpolated" else _GREEN
+        _draw_line(canvas, lines.normal[index], float(lines.offset[index]), colour)
+    return canvas
+
+
+def warp_picture(image: NDArray[np.floating], warp_map: WarpMap, step: int = 16) -> UInt8:
+    """W as a warped grid over the target, beside the length of the parallax W[p] - p.
+
+    The grid is that of the source plane, as the target's surfaces bend it. Pixels that W knows
+    nothing of by measurement are darkened.
+
+    Args:
+        image: (H, W, 3) linear light, the target.
+        step: distance of the grid's lines in the source, pixels.
+
+    Returns:
+        (H, 2W, 3) uint8 RGB, sRGB-encoded.
+    """
+    height, width = warp_map.error.shape
+    canvas = _dimmed(image)
+    measured = np.isfinite(warp_map.error)
+    canvas[~measured] //= 2
+    warp = np.nan_to_num(warp_map.warp, nan=-1e4)
+    cell = np.floor(warp / step)
+    edge = np.zeros((height, width), bool)
+    for axis in (0, 1):
+        changed = (np.diff(cell, axis=axis) != 0).any(axis=-1)
+        edge[: changed.shape[0], : changed.shape[1]] |= changed
+    canvas[edge] = _GREEN
+    displacement = np.linalg.norm(warp - identity_map(height, width), axis=-1)
+    top = max(float(np.percentile(displacement[measured], 99)), 1.0) if measured.any() else 1.0
+    parallax = _colours(np.clip(displacement / top, 0, 1)).astype(np.uint8)
+    parallax[~measured] //= 2
+    return np.hstack([canvas, parallax])
+
+
+def _dimmed(image: NDArray[np.floating]) -> UInt8:
+    coded = np.clip(encode_srgb(np.nan_to_num(image.astype(np.float32))), 0, 1)
+    return np.rint(coded * 255).astype(np.uint8)
+
+
+def _colours(scaled: Float32) -> Float32:
+    code = np.rint(np.clip(scaled, 0, 1) * 255).astype(np.uint8)
+    mapped = cv2.applyColorMap(code, cv2.COLORMAP_TURBO)
+    return mapped[..., ::-1].astype(np.float32)
+
+
+def _draw_line(
+    canvas: UInt8, normal: NDArray[np.float64], offset: float, colour: tuple[int, int, int]
+) -> None:
+    height, width = canvas.shape[:2]
+    foot = -offset * normal
+    along = np.array([-normal[1], normal[0]])
+    middle = np.array([width / 2, height / 2])
+    centre = foot + along * float(along @ (middle - foot))
+    reach = along * float(np.hypot(width, height))
+    if not np.isfinite(centre).all() or np.abs(centre).max() > 1e5:
+        return
+    ends = [tuple(int(v) for v in np.rint((centre + s * reach) * 2**_SHIFT)) for s in (-1, 1)]
+    cv2.line(canvas, ends[0], ends[1], colour, 1, cv2.LINE_AA, _SHIFT)

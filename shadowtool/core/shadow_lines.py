@@ -1,0 +1,271 @@
+"""The swept shadow's edge as a straight line on the reference plane, frame by frame (section 4).
+
+Lines are n·x + d = 0 with unit normal n, in pixels, pixel centres at whole numbers, x to the right
+and y down. The normals of a pass all point to one side, so that neighbouring lines can be
+interpolated; the paper's x = m·y + b fails for lines near horizontal.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Origin = Literal["fit", "refit", "interpolated"]
+
+# Zero crossings between two neighbouring pixels are looked for over so many frames: more lie only
+# between pixels that belong to different things.
+_LARGEST_STEP = 8
+_LEAST_POINTS = 12
+# Root mean square distance of the points from their middle, along the line, pixels.
+_LEAST_SPREAD = 4.0
+# A line is poor if its residual is this many times the pass's median, and larger than the floor.
+_POOR_RATIO, _POOR_FLOOR = 2.5, 0.5
+# A direction jumps if it is this many times the pass's median deviation off its neighbours'
+# course, and by more than the floor, radians.
+_JUMP_RATIO, _JUMP_FLOOR = 5.0, np.radians(0.75)
+
+
+@dataclass(frozen=True)
+class ShadowLines:
+    """One line for each frame of a pass in which the edge crossed the reference plane.
+
+    Attributes:
+        frame: (F,) float64, ascending frame numbers.
+        normal: (F, 2) float64, unit.
+        offset: (F,) float64, pixels.
+        residual: (F,) float64, root mean square distance of the points from the line, pixels.
+        points: (F,) int64, how many points the line rests on.
+        origin: how each came to be, F entries.
+    """
+
+    frame: Float64
+    normal: Float64
+    offset: Float64
+    residual: Float64
+    points: NDArray[np.int64]
+    origin: tuple[Origin, ...]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def angle(self) -> Float64:
+        """(F,) direction of the normals, radians, unwrapped."""
+        return np.unwrap(np.arctan2(self.normal[:, 1], self.normal[:, 0]))
+
+
+class NoLinesError(ValueError):
+    """The reference plane shows too little of the sweep to fit lines."""
+
+
+def fit_shadow_lines(
+    time: NDArray[np.float32], plane: NDArray[np.bool_], frames: Float64
+) -> ShadowLines:
+    """Fit, reject and replace the shadow lines of one pass.
+
+    Args:
+        time: (H, W) shadow times, frame numbers; NaN unknown.
+        plane: (H, W) bool, the reference plane region.
+        frames: (N,) ascending numbers of the frames that were looked at.
+
+    Returns:
+        The lines of all frames from the first to the last in which one could be fitted.
+
+    Raises:
+        NoLinesError: fewer than two frames have a usable line.
+    """
+    groups = zero_crossings(time, plane, frames)
+    fitted = {i: _fit(points) for i, points in groups.items() if len(points) >= _LEAST_POINTS}
+    fits = {i: line for i, line in fitted.items() if line is not None}
+    if len(fits) < 2:
+        raise NoLinesError("fewer than two frames show the shadow's edge on the plane")
+    fits = _aligned(fits)
+    poor = _poor(fits)
+    fits, refitted = _refit(fits, poor, groups)
+    fits = _aligned(fits)
+    dropped = _poor(fits) | _jumping(fits, frames)
+    kept = {i: line for i, line in fits.items() if i not in dropped}
+    if len(kept) < 2:
+        raise NoLinesError("no two lines on the plane agree with each other")
+    first, last = min(kept), max(kept)
+    indices = list(range(first, last + 1))
+    lines = ShadowLines(
+        frame=np.asarray([frames[i] for i in kept], np.float64),
+        normal=np.asarray([line.normal for line in kept.values()]),
+        offset=np.asarray([line.offset for line in kept.values()]),
+        residual=np.asarray([line.residual for line in kept.values()]),
+        points=np.asarray([line.points for line in kept.values()], np.int64),
+        origin=tuple("refit" if i in refitted else "fit" for i in kept),
+    )
+    whole = interpolate_lines(lines, frames[indices])
+    counts = np.asarray([kept[i].points if i in kept else 0 for i in indices], np.int64)
+    origins: list[Origin] = [
+        "interpolated" if i not in kept else "refit" if i in refitted else "fit" for i in indices
+    ]
+    return replace(whole, points=counts, origin=tuple(origins))
+
+
+def interpolate_lines(lines: ShadowLines, times: Float64) -> ShadowLines:
+    """The lines at any times, linearly between the neighbouring ones (step 2a of the outline).
+
+    The angle is interpolated, not the slope; the offset is taken about the lines' common middle,
+    where it hardly depends on the angle.
+
+    Args:
+        times: (N,) frame numbers; outside the lines' span the result is NaN.
+    """
+    times = np.asarray(times, np.float64)
+    inside = (times >= lines.frame[0]) & (times <= lines.frame[-1])
+    pivot = _pivot(lines)
+    about = lines.offset + lines.normal @ pivot
+    angle = np.interp(times, lines.frame, lines.angle)
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    offset = np.interp(times, lines.frame, about) - (normal * pivot).sum(axis=-1)
+    residual = np.interp(times, lines.frame, lines.residual)
+    normal[~inside] = np.nan
+    offset[~inside] = np.nan
+    residual[~inside] = np.nan
+    none = np.zeros(len(times), np.int64)
+    origin: list[Origin] = ["interpolated"] * len(times)
+    return ShadowLines(times, normal, offset, residual, none, tuple(origin))
+
+
+def zero_crossings(
+    time: NDArray[np.float32], plane: NDArray[np.bool_], frames: Float64
+) -> dict[int, Float64]:
+    """Points where t - f changes its sign between neighbouring pixels, for each frame f.
+
+    Returns:
+        By index into ``frames``: (P, 2) float64 points (x, y), interpolated between the pixels'
+        centres. Frames without a point are left out.
+    """
+    clock = _frame_index(time.astype(np.float64), frames)
+    clock[~plane] = np.nan
+    indices, points = [], []
+    for axis in (0, 1):
+        a, b = (clock[:-1], clock[1:]) if axis == 0 else (clock[:, :-1], clock[:, 1:])
+        with np.errstate(invalid="ignore"):
+            low, high = np.minimum(a, b), np.maximum(a, b)
+            usable = (high > low) & (high - low <= _LARGEST_STEP)
+        y, x = np.nonzero(usable)
+        start, end = a[y, x], b[y, x]
+        nearest = np.ceil(low[y, x])
+        # A frame exactly at the lower of two times belongs to the pair on its other side.
+        nearest += nearest == low[y, x]
+        top = high[y, x]
+        for step in range(_LARGEST_STEP + 1):
+            crossed = nearest + step <= top
+            if not crossed.any():
+                break
+            index = nearest[crossed] + step
+            part = (index - start[crossed]) / (end[crossed] - start[crossed])
+            point = np.stack([x[crossed], y[crossed]], axis=-1).astype(np.float64)
+            point[:, 1 - axis] += part
+            indices.append(index.astype(np.int64))
+            points.append(point)
+    if not indices:
+        return {}
+    index, point = np.concatenate(indices), np.concatenate(points)
+    order = np.argsort(index, kind="stable")
+    index, point = index[order], point[order]
+    cuts = np.nonzero(np.diff(index))[0] + 1
+    return {
+        int(i[0]): p
+        for i, p in zip(np.split(index, cuts), np.split(point, cuts), strict=True)
+        if len(i)
+    }
+
+
+def _frame_index(time: Float64, frames: Float64) -> Float64:
+    """Frame numbers to positions in the list of frames, NaN kept."""
+    clock = np.interp(time, frames, np.arange(len(frames), dtype=np.float64))
+    clock[np.isnan(time)] = np.nan
+    return clock
+
+
+@dataclass(frozen=True)
+class _Line:
+    normal: Float64
+    offset: float
+    residual: float
+    points: int
+
+
+def _fit(points: Float64) -> _Line | None:
+    """Total least squares: the normal is the direction in which the points spread least."""
+    middle = points.mean(axis=0)
+    centred = points - middle
+    spread = centred.T @ centred / len(points)
+    values, vectors = np.linalg.eigh(spread)
+    if values[1] < _LEAST_SPREAD**2:
+        return None
+    normal = vectors[:, 0]
+    return _Line(normal, float(-normal @ middle), float(np.sqrt(max(values[0], 0))), len(points))
+
+
+def _aligned(fits: dict[int, _Line]) -> dict[int, _Line]:
+    """Turn each normal to its predecessor's side."""
+    aligned: dict[int, _Line] = {}
+    before: Float64 | None = None
+    for index in sorted(fits):
+        line = fits[index]
+        if before is not None and line.normal @ before < 0:
+            line = replace(line, normal=-line.normal, offset=-line.offset)
+        aligned[index] = line
+        before = line.normal
+    return aligned
+
+
+def _poor(fits: dict[int, _Line]) -> set[int]:
+    residuals = np.asarray([line.residual for line in fits.values()])
+    limit = max(_POOR_RATIO * float(np.median(residuals)), _POOR_FLOOR)
+    return {i for i, line in fits.items() if line.residual > limit}
+
+
+def _refit(
+    fits: dict[int, _Line], poor: set[int], groups: dict[int, Float64]
+) -> tuple[dict[int, _Line], set[int]]:
+    """Fit poor lines anew to the points between the nearest valid lines on both sides."""
+    result, refitted = dict(fits), set[int]()
+    valid = sorted(set(fits) - poor)
+    for index in sorted(poor):
+        before = [i for i in valid if i < index]
+        after = [i for i in valid if i > index]
+        if not before or not after:
+            continue
+        points = groups[index]
+        behind, ahead = (points @ fits[i].normal + fits[i].offset for i in (before[-1], after[0]))
+        # The normals agree, so a point between the lines lies on different sides of them.
+        line = _fit(inside) if len(inside := points[behind * ahead <= 0]) >= _LEAST_POINTS else None
+        if line is not None and line.residual < fits[index].residual:
+            result[index] = line
+            refitted.add(index)
+    return result, refitted
+
+
+def _jumping(fits: dict[int, _Line], frames: Float64) -> set[int]:
+    """Lines whose direction is off the course of the two lines before and the two after."""
+    order = sorted(fits)
+    if len(order) < 5:
+        return set()
+    angle = np.unwrap([np.arctan2(fits[i].normal[1], fits[i].normal[0]) for i in order])
+    at = frames[order]
+    deviation = np.zeros(len(order))
+    for k in range(len(order)):
+        near = [j for j in range(max(k - 2, 0), min(k + 3, len(order))) if j != k]
+        rates = (angle[near] - angle[k]) / (at[near] - at[k])
+        slope = np.median(rates)
+        expected = np.median(angle[near] - slope * (at[near] - at[k]))
+        deviation[k] = abs(angle[k] - expected)
+    limit = max(_JUMP_RATIO * float(np.median(deviation)), _JUMP_FLOOR)
+    return {order[k] for k in np.nonzero(deviation > limit)[0]}
+
+
+def _pivot(lines: ShadowLines) -> Float64:
+    """The point that all the lines pass nearest to."""
+    matrix = lines.normal.T @ lines.normal
+    # Parallel lines leave one direction free; a little pull towards the origin settles it.
+    matrix += np.eye(2) * 1e-9 * len(lines)
+    return np.asarray(np.linalg.solve(matrix, -lines.normal.T @ lines.offset))

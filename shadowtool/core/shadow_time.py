@@ -1,0 +1,98 @@
+"""When the leading edge of a swept shadow reaches each pixel (section 4, temporal analysis)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.noise import NoiseModel, extreme_range
+
+Float32 = NDArray[np.float32]
+
+# Rec.709 luminance.
+LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
+
+@dataclass(frozen=True)
+class ShadowTimes:
+    """The result of one pass.
+
+    Attributes:
+        time: (H, W) float32, frame numbers with fractions; NaN unknown.
+        contrast: (H, W) float32 ≥ 0, I_max - I_min of the pass, linear light.
+    """
+
+    time: Float32
+    contrast: Float32
+
+
+def luminance(image: NDArray[np.floating]) -> Float32:
+    """(H, W, 3) linear RGB to (H, W) float32."""
+    red, green, blue = (image[..., c].astype(np.float32) for c in range(3))
+    return np.asarray(red * LUMA[0] + green * LUMA[1] + blue * LUMA[2], np.float32)
+
+
+class LuminanceRange:
+    """Running I_min and I_max of a pass, in constant memory. Non-finite values are passed over."""
+
+    def __init__(self) -> None:
+        self.lowest: Float32 | None = None
+        self.highest: Float32 | None = None
+        self.frames = 0
+
+    def add(self, gray: Float32) -> None:
+        """Take in one frame's luminance, (H, W) float32."""
+        finite = np.isfinite(gray)
+        if not finite.all():
+            gray = np.where(finite, gray, np.float32(np.nan))
+        if self.lowest is None or self.highest is None:
+            self.lowest, self.highest = gray.copy(), gray.copy()
+        else:
+            np.fmin(self.lowest, gray, out=self.lowest)
+            np.fmax(self.highest, gray, out=self.highest)
+        self.frames += 1
+
+
+def least_contrast(highest: Float32, frames: int, noise: NoiseModel) -> Float32:
+    """The contrast below which a pixel's minimum and maximum may be nothing but noise.
+
+    Returns:
+        (H, W) float32, linear light.
+    """
+    gray = np.repeat(highest[..., None], 3, axis=-1)
+    sigma = np.sqrt(((noise.sigma(gray) * LUMA) ** 2).sum(axis=-1))
+    return np.asarray(sigma * np.maximum(extreme_range(frames), 8), np.float32)
+
+
+class CrossingTimes:
+    """Finds the first crossing of the half-way threshold, frame by frame, in constant memory.
+
+    A pixel crosses in the first frame f whose value lies below (I_min + I_max) / 2; the time is
+    interpolated linearly from the frame before. What follows the leading edge makes no difference.
+    A pixel that is below the threshold from the start has no crossing that was seen: unknown.
+    """
+
+    def __init__(self, lowest: Float32, highest: Float32, least: Float32) -> None:
+        """Args: I_min, I_max and the contrast below which nothing is known, each (H, W)."""
+        self._contrast = highest - lowest
+        self._threshold = (highest + lowest) / 2
+        self._open = self._contrast > least
+        self._time = np.full(lowest.shape, np.nan, np.float32)
+        self._before: Float32 | None = None
+        self._before_frame = 0.0
+
+    def add(self, frame: float, gray: Float32) -> None:
+        """Take in one frame's luminance, (H, W), in the order of the pass."""
+        with np.errstate(invalid="ignore"):
+            below = self._open & (gray < self._threshold)
+        if self._before is not None and below.any():
+            before, now = self._before[below], gray[below]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                part = (before - self._threshold[below]) / (before - now)
+            self._time[below] = self._before_frame + part * (frame - self._before_frame)
+        self._open &= ~below
+        self._before, self._before_frame = gray, frame
+
+    def times(self) -> ShadowTimes:
+        """What was found so far."""
+        return ShadowTimes(self._time.copy(), np.nan_to_num(self._contrast, nan=0.0))

@@ -1,0 +1,195 @@
+"""The displacement map W: where in the source plane each target pixel's shadow comes from.
+
+``warp[y, x] == (x, y)`` is the identity, which W is on the reference plane.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines
+from shadowtool.core.shadow_time import ShadowTimes
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# Passes less far apart than this can't fix a point.
+LEAST_ANGLE = np.radians(10.0)
+# A time read off whole frames is uniformly distributed over one: its standard deviation.
+_FRAME_SIGMA = 1 / np.sqrt(12)
+
+
+@dataclass(frozen=True)
+class WarpMap:
+    """W and how far it can be trusted.
+
+    Attributes:
+        warp: (H, W, 2) float32, pixels (x, y); NaN unknown.
+        error: (H, W) float32, predicted error of W, pixels; infinite where unknown, and where W
+            was filled in from the surroundings.
+    """
+
+    warp: Float32
+    error: Float32
+
+    @property
+    def confidence(self) -> Float32:
+        """(H, W) float32: 1 / (1 + error), 0 where unknown."""
+        return (1 / (1 + self.error)).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One scan: the times of its leading edge and the lines on the reference plane."""
+
+    times: ShadowTimes
+    lines: ShadowLines
+
+
+def identity_map(height: int, width: int) -> Float32:
+    """(H, W, 2) float32 with ``[y, x] == (x, y)``."""
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    return np.stack([x, y], axis=-1)
+
+
+def intersect(passes: list[Pass]) -> WarpMap:
+    """The weighted least squares intersection of the shadow lines through each pixel.
+
+    Each pass contributes its line at t_s[p] with the weight w = c_s[p]² · exp(-E²), E the line's
+    fitting error; q minimises Σ w (n·q + d)².
+
+    Args:
+        passes: two or more, all of one size.
+
+    Returns:
+        W; unknown where fewer than two passes that differ by `LEAST_ANGLE` reached the pixel.
+    """
+    shape = passes[0].times.time.shape
+    # The normal equations Σ w nnᵀ q = -Σ w d n, and the same with each line in units of its own
+    # standard deviation, whose inverse is q's covariance.
+    weighted = np.zeros((5, *shape))
+    information = np.zeros((3, *shape))
+    angle_low = np.full(shape, np.inf)
+    normals = []
+    for scan in passes:
+        known = np.isfinite(scan.times.time)
+        lines = interpolate_lines(scan.lines, scan.times.time[known].astype(np.float64))
+        spans = np.isfinite(lines.offset)
+        known[known] = spans
+        nx, ny = lines.normal[spans].T
+        d, residual = lines.offset[spans], lines.residual[spans]
+        weight = scan.times.contrast[known].astype(np.float64) ** 2 * np.exp(-(residual**2))
+        for row, term in zip(weighted, (nx * nx, nx * ny, ny * ny, nx * d, ny * d), strict=True):
+            row[known] += weight * term
+        speed = np.interp(lines.frame[spans], scan.lines.frame, line_speed(scan.lines, shape))
+        precision = 1 / ((_FRAME_SIGMA * speed) ** 2 + residual**2 + 1e-4)
+        for row, term in zip(information, (nx * nx, nx * ny, ny * ny), strict=True):
+            row[known] += precision * term
+        normal = np.full((*shape, 2), np.nan)
+        normal[known] = np.stack([nx, ny], axis=-1)
+        normals.append(normal)
+    # |n·m| of the best separated pair of passes: the cosine of their angle.
+    for i, one in enumerate(normals):
+        for other in normals[i + 1 :]:
+            cosine = np.abs((one * other).sum(axis=-1))
+            angle_low = np.fmin(angle_low, cosine)
+    known = angle_low <= np.cos(LEAST_ANGLE)
+    a, b, c, e, f = weighted
+    warp = np.full((*shape, 2), np.nan, np.float32)
+    error = np.full(shape, np.inf, np.float32)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        determinant = a * c - b * b
+        known &= determinant > 0
+        warp[..., 0] = np.where(known, (b * f - c * e) / determinant, np.nan)
+        warp[..., 1] = np.where(known, (b * e - a * f) / determinant, np.nan)
+        ia, ib, ic = information
+        variance = (ia + ic) / (ia * ic - ib * ib)
+        error[known] = np.sqrt(variance[known])
+    return WarpMap(warp, error)
+
+
+def line_speed(lines: ShadowLines, shape: tuple[int, ...]) -> Float64:
+    """(F,) how fast the line moves over the picture, pixels a frame along its normal, ≥ 0.
+
+    Measured where the line passes nearest to the middle of a picture of ``shape`` (H, W).
+    """
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    distance = lines.normal @ middle + lines.offset
+    foot = middle - distance[:, None] * lines.normal
+    if len(lines) < 2:
+        return np.zeros(len(lines))
+    # From each line to the next, at the foot of the first.
+    step = np.abs((lines.normal[1:] * foot[:-1]).sum(axis=-1) + lines.offset[1:])
+    step /= np.diff(lines.frame)
+    speed = np.empty(len(lines))
+    speed[0], speed[-1] = step[0], step[-1]
+    speed[1:-1] = (step[:-1] + step[1:]) / 2
+    return speed
+
+
+def pass_angles(passes: list[Pass]) -> list[tuple[int, int, float]]:
+    """The angle between each two passes' middle lines: (i, j, radians in [0, π/2])."""
+    angles = []
+    middles = [scan.lines.angle[len(scan.lines) // 2] for scan in passes]
+    for i, one in enumerate(middles):
+        for j in range(i + 1, len(middles)):
+            difference = abs(one - middles[j]) % np.pi
+            angles.append((i, j, float(min(difference, np.pi - difference))))
+    return angles
+
+
+def resample(image: NDArray[np.floating], warp: Float32, outside: float) -> Float32:
+    """The image as the map sees it: image[W[p]], bilinear (section 4).
+
+    Args:
+        image: (H, W) or (H, W, C).
+        warp: (H', W', 2) float32, pixels; where NaN the result is ``outside``.
+        outside: the value beyond the image's edge.
+
+    Returns:
+        (H', W') or (H', W', C) float32.
+    """
+    # A far but finite position instead of NaN: OpenCV's releases differ in what they make of NaN.
+    sane = np.nan_to_num(warp, nan=-1e6, posinf=-1e6, neginf=-1e6)
+    x, y = (np.ascontiguousarray(np.clip(sane[..., i], -1e6, 1e6)) for i in (0, 1))
+    channels = image.shape[2] if image.ndim == 3 else 1
+    result = cv2.remap(
+        np.ascontiguousarray(image, np.float32),
+        x,
+        y,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(outside,) * min(channels, 4),
+    )
+    return np.asarray(result, np.float32).reshape(*warp.shape[:2], *image.shape[2:])
+
+
+def to_st_map(warp: Float32, width: int, height: int) -> Float32:
+    """Pixels to an ST map: u = (x + 0.5)/width, v = 1 - (y + 0.5)/height.
+
+    Args:
+        warp: (H, W, 2) float32, positions in a picture of ``width`` × ``height``.
+
+    Returns:
+        (H, W, 2) float32 (u, v), origin bottom left.
+    """
+    exact = warp.astype(np.float64)
+    u = (exact[..., 0] + 0.5) / width
+    v = 1 - (exact[..., 1] + 0.5) / height
+    return np.stack([u, v], axis=-1).astype(np.float32)
+
+
+def from_st_map(st_map: Float32, width: int, height: int) -> Float32:
+    """The inverse of `to_st_map`."""
+    exact = st_map.astype(np.float64)
+    x = exact[..., 0] * width - 0.5
+    y = (1 - exact[..., 1]) * height - 0.5
+    return np.stack([x, y], axis=-1).astype(np.float32)
+
+
+def error_of_confidence(confidence: Float32) -> Float32:
+    """The inverse of `WarpMap.confidence`: the predicted error in pixels, infinite for 0."""
+    with np.errstate(divide="ignore"):
+        return (1 / np.clip(confidence, 0, 1) - 1).astype(np.float32)

@@ -1,0 +1,108 @@
+"""Whole files, read at once and written whole or not at all."""
+
+import errno
+import itertools
+import os
+import socket
+import threading
+import zlib
+from pathlib import Path
+
+from shadowtool.errors import InputError, RetryError, ShadowtoolError
+
+_PREFIX = ".shadowtool-"
+_RETRY = {
+    getattr(errno, name)
+    for name in ("ENOSPC", "EDQUOT", "ESTALE", "EIO", "ETIMEDOUT", "EAGAIN", "ENFILE", "EMFILE")
+    if hasattr(errno, name)
+}
+_HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
+_counter = itertools.count()
+
+
+def read_bytes(path: Path) -> bytes:
+    """The file's content.
+
+    Raises:
+        InputError: it isn't there, is no file, or may not be read.
+        RetryError: the machine failed, not the file.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise _translated(error, path, "read") from None
+
+
+def write_bytes(path: Path, data: bytes | memoryview) -> None:
+    """Put a file in place at once: a temporary beside it, then a rename.
+
+    Raises:
+        RetryError: disk full, stale file handle and the like.
+        ShadowtoolError: the folder is gone or may not be written.
+    """
+    temporary = path.parent / f"{_PREFIX}{_HOST}-{os.getpid()}-{_name()}.tmp"
+    try:
+        try:
+            with temporary.open("xb") as file:
+                file.write(data)
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise _translated(error, path, "write") from None
+
+
+def _name() -> str:
+    return f"{threading.get_ident():x}-{next(_counter)}"
+
+
+def make_folder(path: Path) -> None:
+    """Make an output folder with its parents, and clear it of what a killed run left behind.
+
+    Raises:
+        RetryError, ShadowtoolError: as `write_bytes`.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        for leftover in path.glob(f"{_PREFIX}{_HOST}-*.tmp"):
+            if not _alive(leftover.name.removeprefix(f"{_PREFIX}{_HOST}-").split("-")[0]):
+                leftover.unlink(missing_ok=True)
+    except FileExistsError:
+        raise ShadowtoolError(f"{path}: a file stands where the output folder should be") from None
+    except OSError as error:
+        raise _translated(error, path, "write") from None
+
+
+def _alive(pid: str) -> bool:
+    try:
+        os.kill(int(pid), 0)
+    except (ValueError, ProcessLookupError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def fingerprint(data: bytes) -> str:
+    """What stands for a file's content: its size and CRC-32.
+
+    It tells whether an input changed between two runs, not whether somebody forged it.
+    """
+    return f"{len(data)}:{zlib.crc32(data):08x}"
+
+
+def fingerprint_file(path: Path) -> str:
+    """The `fingerprint` of a file's content. Raises as `read_bytes`."""
+    return fingerprint(read_bytes(path))
+
+
+def _translated(error: OSError, path: Path, verb: str) -> ShadowtoolError:
+    reason = error.strerror or str(error)
+    if error.errno in _RETRY:
+        return RetryError(f"{path}: cannot {verb}: {reason}; free the resource and run again")
+    if verb == "read":
+        return InputError(f"{path}: cannot read: {reason}")
+    return ShadowtoolError(f"{path}: cannot write: {reason}; check the output folder")

@@ -1,0 +1,440 @@
+"""EXR and PNG images: the only place that opens either.
+
+EXR pixels are taken as linear light, PNG as sRGB-encoded, unless the caller names a transfer
+function.
+"""
+
+import io
+import logging
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from shadowtool.core.transfer import TRANSFERS
+from shadowtool.errors import DamagedFileError, InputError, ShadowtoolError
+from shadowtool.io.files import fingerprint, read_bytes, write_bytes
+
+logger = logging.getLogger(__name__)
+
+Float32 = NDArray[np.float32]
+
+EXR, PNG = ".exr", ".png"
+# The largest picture that is opened: a header that claims more is broken, or not for this tool.
+_MOST_PIXELS = 1 << 28
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_ATTRIBUTE = "shadowtool."
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file says about its picture apart from the pixels.
+
+    Attributes:
+        width, height: the display window's size, pixels.
+        origin: the display window's upper left corner.
+        pixel_aspect: width of a pixel over its height.
+        frame_rate: frames per second, if the file says so.
+        time_code: OpenEXR's TimeCode, if the file has one.
+        provenance: how a file of ours was made: our attributes without their prefix.
+    """
+
+    width: int
+    height: int
+    origin: tuple[int, int] = (0, 0)
+    pixel_aspect: float = 1.0
+    frame_rate: Fraction | None = None
+    time_code: Any = None
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
+
+
+@dataclass(frozen=True)
+class Image:
+    """A picture as it is stored: code values are not decoded yet.
+
+    Attributes:
+        path: where it came from.
+        header: see `Header`.
+        layers: arrays by name, (H, W) or (H, W, C), of the display window's size; float16 or
+            float32, PNG's 8 and 16 bit as uint8 and uint16. Colour stands under "RGB" or "RGBA".
+        fingerprint: of the file's content.
+    """
+
+    path: Path
+    header: Header
+    layers: Mapping[str, NDArray[Any]]
+    fingerprint: str
+
+    def rgb(self, transfer: str = "auto") -> NDArray[np.floating]:
+        """(H, W, 3) linear light; float16 where the file has halfs and needs no decoding.
+
+        A single-channel picture is taken as grey. Of a file without R, G and B the one layer that
+        has three channels is taken.
+
+        Raises:
+            InputError: there is no colour that could be meant.
+        """
+        name = self._colour_layer()
+        values = self.layers[name]
+        if values.ndim == 2:
+            values = np.repeat(values[..., None], 3, axis=-1)
+        return decode(np.ascontiguousarray(values[..., :3]), resolve_transfer(transfer, self.path))
+
+    def rgba(self, transfer: str = "auto") -> tuple[Float32, Float32]:
+        """Premultiplied colour (H, W, 3) and alpha (H, W), linear light.
+
+        EXR is premultiplied by custom; PNG is not by its standard, and is multiplied here.
+
+        Raises:
+            InputError: the file has no alpha.
+        """
+        name = self._colour_layer()
+        values = self.layers[name]
+        if values.ndim == 2 or values.shape[-1] < 4:
+            raise InputError(f"{self.path}: has no alpha channel; give frames with R, G, B and A")
+        alpha = _unit(values[..., 3])
+        colour = self.rgb(transfer).astype(np.float32)
+        if self.path.suffix.lower() == PNG:
+            colour = colour * alpha[..., None]
+        return colour, alpha
+
+    def plane(self, *names: str) -> Float32:
+        """One channel (H, W) as float32, integer formats scaled to [0, 1], never decoded.
+
+        Args:
+            names: the channels to look for, first choice first; failing them a picture of a
+                single channel, or of three that stand for grey, gives it.
+
+        Raises:
+            InputError: no such channel.
+        """
+        for name in names:
+            if name in self.layers and self.layers[name].ndim == 2:
+                return _unit(self.layers[name])
+            for layer, values in self.layers.items():
+                if layer in ("RGB", "RGBA") and len(name) == 1 and name in layer:
+                    return _unit(values[..., layer.index(name)])
+        only = list(self.layers.values())
+        if len(only) == 1 and only[0].ndim == 2:
+            return _unit(only[0])
+        if len(only) == 1 and next(iter(self.layers)) == "RGB":
+            return _unit(only[0][..., 1])
+        raise InputError(
+            f"{self.path}: has no channel {' or '.join(names)}, only {', '.join(self.layers)}"
+        )
+
+    def _colour_layer(self) -> str:
+        for name in ("RGB", "RGBA"):
+            if name in self.layers:
+                return name
+        if len(self.layers) == 1 or "Y" in self.layers:
+            return "Y" if "Y" in self.layers else next(iter(self.layers))
+        colours = [n for n, v in self.layers.items() if v.ndim == 3]
+        if len(colours) != 1:
+            raise InputError(
+                f"{self.path}: has no R, G, B, only {', '.join(self.layers)};"
+                " write the wanted layer as R, G, B first"
+            )
+        logger.warning("%s: no R, G, B; the layer %s is taken", self.path, colours[0])
+        return colours[0]
+
+
+def resolve_transfer(transfer: str, path: Path) -> str:
+    """The name of the transfer function that "auto" stands for: by the file's kind."""
+    if transfer != "auto":
+        return transfer
+    return "srgb" if path.suffix.lower() == PNG else "linear"
+
+
+def decode(values: NDArray[Any], transfer: str) -> NDArray[np.floating]:
+    """Code values of any stored type to linear light; halfs that are linear stay as they are."""
+    if values.dtype in (np.uint8, np.uint16):
+        return np.asarray(_table(transfer, values.dtype.name)[values])
+    if transfer in ("linear", "none"):
+        return values
+    return TRANSFERS[transfer].decode(values)
+
+
+@cache
+def _table(transfer: str, dtype: str) -> Float32:
+    top = np.iinfo(dtype).max
+    return TRANSFERS[transfer].decode(np.arange(top + 1, dtype=np.float32) / top)
+
+
+def _unit(values: NDArray[Any]) -> Float32:
+    if values.dtype in (np.uint8, np.uint16):
+        return values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
+    return np.ascontiguousarray(values, np.float32)
+
+
+def read_header(path: Path) -> Header:
+    """Size and properties without the pixels. A picture that is cut off later passes.
+
+    Raises:
+        InputError: no such file, or of a kind that is refused: deep, luminance and chroma, too
+            large, no EXR or PNG.
+        DamagedFileError: not even the header can be read.
+    """
+    if path.suffix.lower() == PNG:
+        try:
+            with path.open("rb") as file:
+                return _png_header(path, file.read(4096))
+        except OSError:
+            return _png_header(path, read_bytes(path))
+    if not path.is_file():
+        read_bytes(path)
+    return _exr_header(path, _open_exr(path, str(path), header_only=True))
+
+
+def read_image(path: Path) -> Image:
+    """Read a picture whole.
+
+    Raises:
+        InputError: as `read_header`.
+        DamagedFileError: cut off, or the pixels don't decode.
+    """
+    data = read_bytes(path)
+    if path.suffix.lower() == PNG:
+        return _decode_png(path, data)
+    return _decode_exr(path, data)
+
+
+def write_exr(
+    path: Path,
+    channels: Mapping[str, NDArray[Any]],
+    header: Header | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> None:
+    """Write a scanline EXR with ZIP compression, whole or not at all.
+
+    Args:
+        channels: arrays by name, (H, W), or (H, W, 3) and (H, W, 4) under "RGB" and "RGBA";
+            float16 or float32.
+        header: where display window's origin, pixel aspect, frame rate and time code come from.
+        provenance: how the file was made; becomes string attributes.
+
+    Raises:
+        RetryError, ShadowtoolError: as `write_bytes`.
+    """
+    arrays = {}
+    for name, values in channels.items():
+        if values.dtype not in (np.float16, np.float32):
+            raise TypeError(f"channel {name} of {path} is {values.dtype}, not half or float")
+        arrays[name] = np.ascontiguousarray(values)
+    height, width = next(iter(arrays.values())).shape[:2]
+    attributes: dict[str, Any] = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+    }
+    if header is not None:
+        first = np.array(header.origin, np.int32)
+        last = first + np.array([width - 1, height - 1], np.int32)
+        attributes["displayWindow"] = attributes["dataWindow"] = (first, last)
+        attributes["pixelAspectRatio"] = header.pixel_aspect
+        if header.frame_rate is not None:
+            attributes["framesPerSecond"] = header.frame_rate
+        if header.time_code is not None:
+            attributes["timeCode"] = header.time_code
+    for key, value in (provenance or {}).items():
+        attributes[_ATTRIBUTE + key] = value
+    buffer = io.BytesIO()
+    try:
+        OpenEXR.File(attributes, arrays).write(buffer)
+    except RuntimeError as error:
+        raise ShadowtoolError(f"{path}: cannot be encoded: {error}") from None
+    write_bytes(path, buffer.getbuffer())
+
+
+def write_png(
+    path: Path, values: NDArray[Any], provenance: Mapping[str, str] | None = None
+) -> None:
+    """Write a PNG, whole or not at all.
+
+    Args:
+        values: (H, W), (H, W, 3) RGB or (H, W, 4) RGBA; uint8 or uint16 code values.
+        provenance: how the file was made; becomes text chunks.
+    """
+    if values.dtype not in (np.uint8, np.uint16):
+        raise TypeError(f"{path}: PNG holds 8 or 16 bits, not {values.dtype}")
+    order = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+    if values.ndim == 3:
+        values = cv2.cvtColor(np.ascontiguousarray(values), order[values.shape[2]])
+    done, buffer = cv2.imencode(PNG, np.ascontiguousarray(values))
+    if not done:
+        raise ShadowtoolError(f"{path}: cannot be encoded as PNG")
+    data = buffer.tobytes()
+    # Text chunks may stand anywhere between the header (33 bytes with the signature) and the end.
+    texts = b"".join(
+        _png_chunk(b"tEXt", f"{_ATTRIBUTE}{key}".encode("latin-1") + b"\0" + _latin(value))
+        for key, value in (provenance or {}).items()
+    )
+    write_bytes(path, data[:33] + texts + data[33:])
+
+
+def to_half(values: NDArray[np.floating]) -> NDArray[np.float16]:
+    """Round to half floats; what is too large becomes the largest half, NaN stays."""
+    return np.asarray(np.clip(values, -65504, 65504), np.float16)
+
+
+def to_code(linear: NDArray[np.floating], transfer: str = "srgb") -> NDArray[np.uint16]:
+    """Linear light to 16-bit code values; NaN becomes 0."""
+    coded = TRANSFERS[transfer].encode(linear)
+    return np.rint(np.clip(np.nan_to_num(coded), 0, 1) * 65535).astype(np.uint16)
+
+
+def _open_exr(path: Path, source: str | io.BytesIO, header_only: bool = False) -> Any:
+    try:
+        return OpenEXR.File(source, separate_channels=False, header_only=header_only)
+    except (RuntimeError, ValueError, UnicodeDecodeError, TypeError) as error:
+        raise DamagedFileError(
+            f"{path}: no EXR, or its header is damaged; write the frame again"
+        ) from error
+
+
+def _exr_header(path: Path, file: Any) -> Header:
+    try:
+        if not file.parts:
+            raise DamagedFileError(f"{path}: the EXR holds no picture; write the frame again")
+        raw = file.header(0)
+    except (RuntimeError, UnicodeDecodeError) as error:
+        raise DamagedFileError(f"{path}: the EXR header is damaged") from error
+    if raw.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
+        raise InputError(f"{path}: a deep EXR; flatten it first")
+    names = {channel.name for channel in raw.get("channels", [])}
+    if {"RY", "BY"} & names:
+        raise InputError(f"{path}: a luminance/chroma EXR; convert it to R, G, B first")
+    first, last = _window(path, raw, "displayWindow")
+    _window(path, raw, "dataWindow")
+    aspect = float(raw.get("pixelAspectRatio", 1.0))
+    rate = raw.get("framesPerSecond")
+    return Header(
+        width=last[0] - first[0] + 1,
+        height=last[1] - first[1] + 1,
+        origin=first,
+        pixel_aspect=aspect if np.isfinite(aspect) and aspect > 0 else 1.0,
+        frame_rate=rate if isinstance(rate, Fraction) else None,
+        time_code=raw.get("timeCode"),
+        provenance={
+            key.removeprefix(_ATTRIBUTE): value
+            for key, value in raw.items()
+            if key.startswith(_ATTRIBUTE) and isinstance(value, str)
+        },
+    )
+
+
+Corner = tuple[int, int]
+
+
+def _window(path: Path, raw: Mapping[str, Any], name: str) -> tuple[Corner, Corner]:
+    first, last = (tuple(int(v) for v in corner) for corner in raw[name])
+    width, height = last[0] - first[0] + 1, last[1] - first[1] + 1
+    if width < 1 or height < 1 or width * height > _MOST_PIXELS:
+        raise InputError(f"{path}: its {name} is {width}x{height} pixels; that can't be right")
+    return (first[0], first[1]), (last[0], last[1])
+
+
+def _decode_exr(path: Path, data: bytes) -> Image:
+    # The header first: a picture that is refused must not be decoded, and a damaged part of a
+    # multi-part file vanishes without a word when the pixels are read.
+    listed = _open_exr(path, io.BytesIO(data), header_only=True)
+    header = _exr_header(path, listed)
+    file = _open_exr(path, io.BytesIO(data))
+    if len(file.parts) != len(listed.parts):
+        raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
+    if len(file.parts) > 1:
+        logger.warning("%s: of %d parts the first is taken", path, len(file.parts))
+    raw = file.header(0)
+    first, last = _window(path, raw, "dataWindow")
+    layers = {}
+    for name, channel in file.channels(0).items():
+        values = channel.pixels
+        if values is None or values.shape[:2] != (last[1] - first[1] + 1, last[0] - first[0] + 1):
+            raise InputError(f"{path}: channel {name} is subsampled; write it at full size")
+        layers[name] = _placed(values, first, header)
+    if not layers:
+        raise InputError(f"{path}: has no channels")
+    return Image(path, header, layers, fingerprint(data))
+
+
+def _placed(values: NDArray[Any], first: tuple[int, int], header: Header) -> NDArray[Any]:
+    """A data window's pixels in the display window: black where there are none, overscan cut."""
+    x, y = first[0] - header.origin[0], first[1] - header.origin[1]
+    height, width = values.shape[:2]
+    if (x, y) == (0, 0) and (width, height) == header.size:
+        return values
+    canvas = np.zeros((header.height, header.width, *values.shape[2:]), values.dtype)
+    target = (
+        slice(max(y, 0), max(min(y + height, header.height), 0)),
+        slice(max(x, 0), max(min(x + width, header.width), 0)),
+    )
+    source = (
+        slice(max(-y, 0), max(-y, 0) + canvas[target].shape[0]),
+        slice(max(-x, 0), max(-x, 0) + canvas[target].shape[1]),
+    )
+    canvas[target] = values[source]
+    return canvas
+
+
+def _png_header(path: Path, data: bytes) -> Header:
+    if not data.startswith(_PNG_SIGNATURE) or len(data) < 33:
+        raise DamagedFileError(f"{path}: no PNG, or cut off; write the frame again")
+    width, height = struct.unpack(">II", data[16:24])
+    if not 0 < width * height <= _MOST_PIXELS:
+        raise InputError(f"{path}: claims {width}x{height} pixels; that can't be right")
+    return Header(width, height, provenance=_png_texts(data))
+
+
+def _png_texts(data: bytes) -> dict[str, str]:
+    texts = {}
+    position = len(_PNG_SIGNATURE)
+    while position + 8 <= len(data):
+        length, kind = struct.unpack(">I4s", data[position : position + 8])
+        if kind == b"IDAT":
+            break
+        if kind == b"tEXt":
+            key, _, value = data[position + 8 : position + 8 + length].partition(b"\0")
+            if key.startswith(_ATTRIBUTE.encode()):
+                texts[key.decode("latin-1").removeprefix(_ATTRIBUTE)] = value.decode("latin-1")
+        position += length + 12
+    return texts
+
+
+def _png_chunk(kind: bytes, content: bytes) -> bytes:
+    check = zlib.crc32(kind + content)
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
+
+
+def _latin(text: str) -> bytes:
+    return text.encode("latin-1", "replace")
+
+
+def _decode_png(path: Path, data: bytes) -> Image:
+    header = _png_header(path, data)
+    # A cut-off PNG decodes to a picture that is grey from there on; its end marker is missing.
+    whole = data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82")
+    try:
+        values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise DamagedFileError(f"{path}: the PNG can't be decoded: {error.err}") from None
+    if values is None or not whole:
+        raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
+    if values.ndim == 2:
+        layers = {"Y": values}
+    elif values.shape[2] == 4:
+        layers = {"RGBA": cv2.cvtColor(values, cv2.COLOR_BGRA2RGBA)}
+    else:
+        layers = {"RGB": cv2.cvtColor(values, cv2.COLOR_BGR2RGB)}
+    return Image(path, header, layers, fingerprint(data))

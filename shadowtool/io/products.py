@@ -1,0 +1,231 @@
+"""What the steps hand to each other: plates, scans, warp maps, and the record of how each was made.
+
+Whatever is read here may have been edited by hand or by another program, so it is checked.
+"""
+
+import contextlib
+import fcntl
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.plates import Plates
+from shadowtool.core.shadow_lines import ShadowLines
+from shadowtool.core.shadow_time import ShadowTimes
+from shadowtool.core.warp_map import (
+    Pass,
+    WarpMap,
+    error_of_confidence,
+    from_st_map,
+    to_st_map,
+)
+from shadowtool.errors import InputError
+from shadowtool.io.files import fingerprint, read_bytes, write_bytes
+from shadowtool.io.image import EXR, PNG, Header, Image, read_image, write_exr
+
+MANIFEST = "shadowtool.json"
+LINES = "lines.json"
+SCAN = "scan.exr"
+WARP = "warp.exr"
+
+Provenance = Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class StoredPlates:
+    """Plates from a folder, with what their files say of themselves."""
+
+    plates: Plates
+    header: Header
+    fingerprint: str
+
+
+def plate_files(folder: Path) -> list[Path]:
+    """The files under which `plate` writes."""
+    return [folder / f"{name}{EXR}" for name in ("lit", "shadow", "confidence")]
+
+
+def read_plates(folder: Path) -> StoredPlates:
+    """Read ``lit`` and ``shadow`` (EXR or PNG), and ``confidence.exr`` if it is there.
+
+    Raises:
+        InputError: a plate is missing, or their sizes differ.
+    """
+    images = [read_image(_plate(folder, name)) for name in ("lit", "shadow")]
+    lit, shadow = images
+    if lit.header.size != shadow.header.size:
+        raise InputError(
+            f"{folder}: lit is {_size(lit.header)}, shadow is {_size(shadow.header)};"
+            " plates must be of one size"
+        )
+    frames = None
+    confidence = folder / f"confidence{EXR}"
+    if confidence.is_file():
+        image = read_image(confidence)
+        images.append(image)
+        frames = np.nan_to_num(image.plane("frames")).astype(np.uint32)
+        if image.header.size != lit.header.size:
+            raise InputError(f"{confidence}: is not of the plates' size")
+    plates = Plates(lit.rgb().astype(np.float32), shadow.rgb().astype(np.float32), frames)
+    return StoredPlates(plates, lit.header, " ".join(i.fingerprint for i in images))
+
+
+def _plate(folder: Path, name: str) -> Path:
+    for suffix in (EXR, PNG):
+        if (folder / f"{name}{suffix}").is_file():
+            return folder / f"{name}{suffix}"
+    raise InputError(f"{folder}: has no {name}{EXR}; make the plates with `shadowtool plate`")
+
+
+def write_plates(
+    folder: Path,
+    plates: Plates,
+    contrast: NDArray[np.float32],
+    header: Header,
+    provenance: Provenance,
+) -> None:
+    """Write lit, shadow and confidence (channels contrast and frames)."""
+    lit, shadow, confidence = plate_files(folder)
+    write_exr(lit, {"RGB": plates.lit}, header, provenance)
+    write_exr(shadow, {"RGB": plates.shadow}, header, provenance)
+    frames = plates.frames if plates.frames is not None else np.zeros(contrast.shape)
+    layers = {"contrast": contrast, "frames": frames.astype(np.float32)}
+    write_exr(confidence, layers, header, provenance)
+
+
+def write_scan(folder: Path, scan: Pass, header: Header, provenance: Provenance) -> None:
+    """Write ``scan.exr`` and ``lines.json``."""
+    layers = {"time": scan.times.time, "contrast": scan.times.contrast}
+    write_exr(folder / SCAN, layers, header, provenance)
+    lines = scan.lines
+    rows = [
+        {
+            "frame": float(lines.frame[i]),
+            "normal": [float(v) for v in lines.normal[i]],
+            "offset": float(lines.offset[i]),
+            "residual": float(lines.residual[i]),
+            "points": int(lines.points[i]),
+            "origin": lines.origin[i],
+        }
+        for i in range(len(lines))
+    ]
+    height, width = scan.times.time.shape
+    record = {"width": width, "height": height, **provenance, "lines": rows}
+    write_json(folder / LINES, record)
+
+
+def read_scan(folder: Path) -> tuple[Pass, Header, str]:
+    """Read what `write_scan` wrote: the pass, its header, and its fingerprint.
+
+    Raises:
+        InputError: a file is missing, or does not hold what it should.
+    """
+    if not (folder / SCAN).is_file():
+        raise InputError(f"{folder}: has no {SCAN}; make it with `shadowtool scan`")
+    image = read_image(folder / SCAN)
+    data = read_bytes(folder / LINES)
+    lines = _parse_lines(folder / LINES, data, image)
+    time, contrast = image.plane("time"), np.maximum(image.plane("contrast"), 0)
+    time = np.where(np.isfinite(time), time, np.float32(np.nan))
+    contrast = np.where(np.isfinite(contrast), contrast, np.float32(0))
+    scan = Pass(ShadowTimes(time, contrast), lines)
+    return scan, image.header, f"{image.fingerprint} {fingerprint(data)}"
+
+
+def _parse_lines(path: Path, data: bytes, image: Image) -> ShadowLines:
+    try:
+        record = json.loads(data)
+        rows = record["lines"]
+        lines = ShadowLines(
+            frame=np.array([row["frame"] for row in rows], np.float64),
+            normal=np.array([row["normal"] for row in rows], np.float64),
+            offset=np.array([row["offset"] for row in rows], np.float64),
+            residual=np.array([row["residual"] for row in rows], np.float64),
+            points=np.array([row.get("points", 0) for row in rows], np.int64),
+            origin=tuple(str(row.get("origin", "fit")) for row in rows),  # type: ignore[misc]
+        )
+        size = (int(record["width"]), int(record["height"]))
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        raise InputError(f"{path}: holds no shadow lines; run `shadowtool scan` again") from None
+    if len(lines) < 2 or lines.normal.shape != (len(lines), 2):
+        raise InputError(f"{path}: holds no shadow lines; run `shadowtool scan` again")
+    columns = (lines.frame, lines.normal, lines.offset, lines.residual)
+    unit = np.abs(np.hypot(*lines.normal.T) - 1) < 1e-3
+    if (
+        not all(np.isfinite(column).all() for column in columns)
+        or not unit.all()
+        or not (np.diff(lines.frame) > 0).all()
+    ):
+        raise InputError(f"{path}: its lines are no lines; run `shadowtool scan` again")
+    if size != image.header.size:
+        raise InputError(f"{path}: is for {size[0]}x{size[1]}, {SCAN} is {_size(image.header)}")
+    return lines
+
+
+def write_warp(path: Path, warp_map: WarpMap, header: Header, provenance: Provenance) -> None:
+    """Write an ST map: R, G = u, v, B = 0, A = confidence; float32."""
+    height, width = warp_map.error.shape
+    layers = np.zeros((height, width, 4), np.float32)
+    layers[..., :2] = to_st_map(warp_map.warp, width, height)
+    layers[..., 3] = warp_map.confidence
+    write_exr(path, {"RGBA": layers}, header, provenance)
+
+
+def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
+    """Read an ST map as W in pixels of a source picture of the map's own size.
+
+    Raises:
+        InputError: it has no R and G.
+    """
+    image = read_image(path)
+    st_map = np.stack([image.plane("R"), image.plane("G")], axis=-1)
+    height, width = st_map.shape[:2]
+    layer = image.layers.get("RGBA")
+    error = (
+        np.zeros((height, width), np.float32)
+        if layer is None
+        else error_of_confidence(layer[..., 3].astype(np.float32))
+    )
+    return WarpMap(from_st_map(st_map, width, height), error), image.header, image.fingerprint
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """A step's record; empty if there is none, or none that can be read."""
+    try:
+        record = json.loads((folder / MANIFEST).read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def write_json(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a record so that the same content gives the same bytes."""
+    text = json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    write_bytes(path, text.encode() + b"\n")
+
+
+@contextlib.contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Keep other processes of ours from rewriting the folder's manifest meanwhile."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        yield
+        return
+    try:
+        # Some network file systems lock no folders; there the rename alone has to do.
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _size(header: Header) -> str:
+    return f"{header.width}x{header.height}"

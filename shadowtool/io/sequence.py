@@ -1,0 +1,232 @@
+"""Numbered frames on disk: a folder, a pattern, or one file."""
+
+import itertools
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+
+from fileseq import findSequenceOnDisk, findSequencesOnDisk
+from fileseq.exceptions import FileSeqException
+from fileseq.filesequence import FileSequence
+from fileseq.frameset import FrameSet
+
+from shadowtool.choices import Missing
+from shadowtool.errors import InputError, OptionError
+from shadowtool.io.image import EXR, PNG
+
+Frame = int | Decimal
+
+_TOKENS = re.compile(r"[#@]|%\d*d|\$F\d*|<UDIM>")
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Frames of one kind in one folder.
+
+    Attributes:
+        name: the part of the files' names before the number, without its separator.
+        pattern: how a person would write it, for messages and records.
+        files: path by frame number, ascending.
+    """
+
+    name: str
+    pattern: str
+    files: dict[Frame, Path]
+
+    @property
+    def frames(self) -> tuple[Frame, ...]:
+        return tuple(self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def path(self, frame: Frame) -> Path:
+        """The frame's file.
+
+        Raises:
+            InputError: the sequence has no such frame.
+        """
+        try:
+            return self.files[frame]
+        except KeyError:
+            raise InputError(
+                f"{self.pattern}: has no frame {frame}, only {frame_range(self.files)}"
+            ) from None
+
+    def gaps(self) -> tuple[Frame, ...]:
+        """Frames that are missing between the first and the last.
+
+        A constant step of two or more over three frames or more is taken as meant so.
+        """
+        numbers = [frame for frame in self.files if isinstance(frame, int)]
+        if len(numbers) != len(self.files) or len(numbers) < 2:
+            return ()
+        steps = {b - a for a, b in itertools.pairwise(numbers)}
+        if len(steps) == 1 and len(numbers) > 2:
+            return ()
+        step = min(steps) if len(numbers) > 2 else 1
+        if any(s % step for s in steps):
+            step = 1
+        present = set(numbers)
+        return tuple(f for f in range(numbers[0], numbers[-1], step) if f not in present)
+
+    def select(
+        self, frames: str | None, missing: Missing = "error"
+    ) -> tuple[list[Frame], list[Frame]]:
+        """The frames to work on, and those that should be there but aren't.
+
+        Args:
+            frames: a range such as ``1001-1048x2,1100``; None for all.
+            missing: "error" refuses to go on without the missing ones.
+
+        Raises:
+            InputError: frames are missing, or none is left.
+            OptionError: the range can't be read.
+        """
+        if frames is None:
+            wanted: Iterable[Frame] = sorted({*self.files, *self.gaps()})
+        else:
+            wanted = parse_frames(frames)
+        present = [frame for frame in wanted if frame in self.files]
+        absent = [frame for frame in wanted if frame not in self.files]
+        if absent and (missing == "error" or not present):
+            raise InputError(
+                f"{self.pattern}: missing frames {frame_range(absent)};"
+                " restore them, or give --missing skip"
+            )
+        return present, absent
+
+
+def open_sequence(source: str | Path, role: str = "frames") -> Sequence:
+    """Find the frames that a folder, a pattern or a file name stands for.
+
+    Args:
+        source: a folder that holds one sequence; ``a/b.%04d.exr``, ``a/b.####.exr``,
+            ``a/b.1001-1048#.exr``; or a single EXR or PNG.
+        role: what the frames are for, used in messages.
+
+    Raises:
+        InputError: nothing there, nothing that can be read, or more than one sequence.
+    """
+    text = os.fspath(source)
+    path = Path(text)
+    try:
+        if path.is_dir():
+            return _in_folder(path, role)
+        if path.is_file():
+            return _single(path)
+    except OSError as error:
+        raise InputError(f"{_short(text)}: cannot look there: {error.strerror}") from None
+    if not _TOKENS.search(path.name):
+        raise InputError(f"{_short(text)}: no such file or folder for the {role}")
+    return _of_pattern(path, role)
+
+
+def parse_frames(text: str) -> list[Frame]:
+    """Frame numbers of a range such as ``1001-1048``, ``1001-1048x2``, ``1,5,9-20``.
+
+    ``1-10:2`` means every second frame, as on a render farm.
+
+    Returns:
+        Ascending, each once.
+
+    Raises:
+        OptionError: it can't be read.
+    """
+    try:
+        frames = _frames(FrameSet(text.strip().replace(":", "x")))
+    except (FileSeqException, ValueError, TypeError):
+        frames = []
+    if not frames:
+        raise OptionError(
+            f"--frames {_short(text)}: not a frame range; write 1001-1048, 1001-1048x2 or 1,5,9-20"
+        )
+    return sorted(set(frames))
+
+
+def frame_range(frames: Iterable[Frame]) -> str:
+    """Frame numbers as a person writes them: ``1001-1048,1100``."""
+    return str(FrameSet(sorted(frames))) or "none"
+
+
+def frame_file(name: str, frame: Frame, suffix: str) -> str:
+    """``NAME.1001.exr``: four digits at least, a fraction kept."""
+    whole, dot, part = str(frame).partition(".")
+    sign, digits = ("-", whole[1:]) if whole.startswith("-") else ("", whole)
+    return f"{name}.{sign}{digits.zfill(4)}{dot}{part}{suffix}"
+
+
+def _in_folder(folder: Path, role: str) -> Sequence:
+    found = _sequences(folder)
+    if not found:
+        raise InputError(f"{folder}: holds no EXR or PNG frames for the {role}")
+    if len(found) > 1:
+        names = " and ".join(sequence.pattern for sequence in found[:2])
+        more = f" and {len(found) - 2} more" if len(found) > 2 else ""
+        raise InputError(f"{folder}: holds {names}{more}; name the one that is meant")
+    return found[0]
+
+
+def _sequences(folder: Path) -> list[Sequence]:
+    found = findSequencesOnDisk(os.fspath(folder))
+    images = [s for s in found if s.extension().lower() in (EXR, PNG)]
+    if len(images) > 1 and all(s.frameSet() for s in images):
+        # 1001.00, 1001.50, 1002.00 look like a sequence for each whole number.
+        fractional = findSequencesOnDisk(os.fspath(folder), allow_subframes=True)
+        fractional = [s for s in fractional if s.extension().lower() in (EXR, PNG)]
+        if len(fractional) == 1:
+            images = fractional
+    numbered = [s for s in images if s.frameSet()]
+    # One sequence and a still beside it (a reference, a slate) is one sequence.
+    chosen = numbered or images
+    return [_from_fileseq(s) for s in sorted(chosen, key=str)]
+
+
+def _from_fileseq(sequence: FileSequence) -> Sequence:
+    folder = Path(sequence.dirname())
+    frame_set = sequence.frameSet()
+    if not frame_set:
+        return _single(Path(str(sequence)))
+    files = {frame: Path(sequence.frame(frame)) for frame in sorted(_frames(frame_set))}
+    padding = "#" * max(sequence.zfill(), 1)
+    name = sequence.basename().rstrip("._- ")
+    pattern = folder / f"{sequence.basename()}{padding}{sequence.extension()}"
+    return Sequence(name or folder.name, os.fspath(pattern), files)
+
+
+def _single(path: Path) -> Sequence:
+    if path.suffix.lower() not in (EXR, PNG):
+        raise InputError(f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on it first")
+    number = re.search(r"[._](\d+)$", path.stem)
+    return Sequence(path.stem, os.fspath(path), {int(number[1]) if number else 1: path})
+
+
+def _of_pattern(path: Path, role: str) -> Sequence:
+    try:
+        wanted = FileSequence(os.fspath(path))
+        found = findSequenceOnDisk(os.fspath(path))
+    except (FileSeqException, ValueError, OSError):
+        raise InputError(f"{_short(os.fspath(path))}: no frames for the {role} are there") from None
+    if found.extension().lower() not in (EXR, PNG):
+        raise InputError(f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on it first")
+    sequence = _from_fileseq(found)
+    asked = _frames(wanted.frameSet() or ())
+    if not asked:
+        return sequence
+    absent = [frame for frame in asked if frame not in sequence.files]
+    if absent:
+        raise InputError(f"{sequence.pattern}: missing frames {frame_range(absent)}")
+    files = {frame: sequence.files[frame] for frame in sorted(asked)}
+    return Sequence(sequence.name, sequence.pattern, files)
+
+
+def _frames(frame_set: Iterable[int | float | Decimal]) -> list[Frame]:
+    """Frame numbers as fileseq gives them, which is never a float for numbers read from text."""
+    return [f if isinstance(f, int) else Decimal(str(f)) for f in frame_set]
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 200 else f"{text[:100]}…{text[-60:]}"

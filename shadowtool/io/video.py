@@ -1,0 +1,202 @@
+"""Movies and cameras, decoded at the depth that they were stored with."""
+
+import logging
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
+from shadowtool.errors import DamagedFileError, InputError
+
+logger = logging.getLogger(__name__)
+
+Float32 = NDArray[np.float32]
+
+# Code points of ITU-T H.273, which every container uses.
+_TRANSFERS = {1: "rec709", 6: "rec709", 14: "rec709", 15: "rec709", 13: "srgb", 8: "linear"}
+_UNSPECIFIED = {0, 2}
+# Red's and blue's share of luma, by matrix coefficients.
+_MATRICES = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
+_FULL_RANGE = 2
+
+
+@dataclass(frozen=True)
+class MovieInfo:
+    """What a movie says of itself, and what had to be assumed.
+
+    Attributes:
+        frame_rate: frames per second, None if the container has none.
+        pixel_format: FFmpeg's name.
+        bits: of each stored sample.
+        transfer: the transfer function's name; None if it is one that we can't undo.
+        assumed: sentences about what the file left open.
+    """
+
+    width: int
+    height: int
+    frame_rate: Fraction | None
+    pixel_format: str
+    bits: int
+    transfer: str | None
+    assumed: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MovieFrame:
+    """One decoded frame.
+
+    Attributes:
+        position: counted from 0.
+        seconds: presentation time, None if unknown.
+        coded: (H, W, 3) float32 RGB code values, 0 to 1 nominal.
+    """
+
+    position: int
+    seconds: float | None
+    coded: Float32
+
+
+def is_movie(path: Path) -> bool:
+    """Whether the file opens as a movie; a still picture does not count."""
+    try:
+        with av.open(str(path)) as container:
+            return bool(container.streams.video) and container.format.name not in (
+                "image2",
+                "png_pipe",
+                "exr_pipe",
+            )
+    except (FFmpegError, OSError, ValueError):
+        return False
+
+
+class Movie:
+    """A movie file, read from its beginning, once.
+
+    Raises:
+        InputError: there is no video in it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._container = av.open(str(path))
+            self._stream = self._container.streams.video[0]
+        except (FFmpegError, OSError, ValueError, IndexError):
+            raise InputError(f"{path}: no movie that can be decoded") from None
+        self._stream.thread_type = "AUTO"
+        self.info = self._describe()
+
+    def frames(self) -> Iterator[MovieFrame]:
+        """All frames in order.
+
+        Raises:
+            DamagedFileError: decoding fails.
+        """
+        position = 0
+        try:
+            for frame in self._container.decode(self._stream):
+                yield MovieFrame(position, frame.time, self._coded(frame))
+                position += 1
+        except FFmpegError as error:
+            raise DamagedFileError(
+                f"{self.path}: decoding stops after {position} frames: {error.strerror}"
+            ) from None
+        finally:
+            self._container.close()
+        if position == 0:
+            raise DamagedFileError(f"{self.path}: holds no frame")
+
+    def _describe(self) -> MovieInfo:
+        context = self._stream.codec_context
+        pixel_format = context.format
+        if pixel_format is None:
+            raise InputError(f"{self.path}: no movie that can be decoded")
+        assumed = []
+        trc = int(context.color_trc)
+        transfer = _TRANSFERS.get(trc)
+        if trc in _UNSPECIFIED:
+            transfer = "rec709"
+            assumed.append("the movie names no transfer function: Rec.709 is assumed")
+        self._rgb = pixel_format.is_rgb
+        self._gray = len(pixel_format.components) < 3
+        matrix = int(context.colorspace)
+        self._full = int(context.color_range) == _FULL_RANGE or pixel_format.name.startswith("yuvj")
+        if not self._rgb and not self._gray:
+            if matrix not in _MATRICES:
+                high = context.width > 1024 or context.height > 576
+                matrix = 1 if high else 6
+                name = "Rec.709" if high else "Rec.601"
+                assumed.append(f"the movie names no colour matrix: {name} is assumed by its size")
+            self._weights = _MATRICES[matrix]
+        if not self._rgb and int(context.color_range) == 0 and not self._full:
+            assumed.append("the movie names no range: video range (16-235) is assumed")
+        rate = self._stream.average_rate or self._stream.guessed_rate
+        return MovieInfo(
+            width=context.width,
+            height=context.height,
+            frame_rate=Fraction(rate) if rate else None,
+            pixel_format=pixel_format.name,
+            bits=max(component.bits for component in pixel_format.components),
+            transfer=transfer,
+            assumed=tuple(assumed),
+        )
+
+    def _coded(self, frame: av.VideoFrame) -> Float32:
+        # FFmpeg's own conversion to RGB is off by up to half a per cent; it only unpacks the
+        # planes here and brings chroma to full size, and the matrix is applied below.
+        if self._rgb:
+            packed = frame.reformat(format="gbrp16le").to_ndarray()
+            return packed.astype(np.float32) / np.float32(65535)
+        if self._gray:
+            gray = frame.reformat(format="gray16le").to_ndarray().astype(np.float32)
+            return np.repeat(self._luma(gray)[..., None], 3, axis=-1)
+        planes = frame.reformat(format="yuv444p16le").to_ndarray(channel_last=True)
+        code = planes.astype(np.float32)
+        luma = self._luma(code[..., 0])
+        blue_difference, red_difference = (self._chroma(code[..., i]) for i in (1, 2))
+        kr, kb = self._weights
+        red = luma + np.float32(2 * (1 - kr)) * red_difference
+        blue = luma + np.float32(2 * (1 - kb)) * blue_difference
+        green = (luma - np.float32(kr) * red - np.float32(kb) * blue) / np.float32(1 - kr - kb)
+        return np.stack([red, green, blue], axis=-1)
+
+    def _luma(self, code: Float32) -> Float32:
+        if self._full:
+            return code / np.float32(65535)
+        return (code - np.float32(16 * 256)) / np.float32(219 * 256)
+
+    def _chroma(self, code: Float32) -> Float32:
+        scale = np.float32(65535) if self._full else np.float32(224 * 256)
+        return (code - np.float32(128 * 256)) / scale
+
+
+def camera_frames(device: int, seconds: float) -> Iterator[MovieFrame]:
+    """Frames of a camera, as long as asked for; 8 bits, which is what OpenCV gives.
+
+    Raises:
+        InputError: no such camera, or it gives no picture.
+    """
+    camera = cv2.VideoCapture(device)
+    try:
+        if not camera.isOpened():
+            raise InputError(f"--device {device}: no camera answers there")
+        start = time.monotonic()
+        position = 0
+        while (now := time.monotonic() - start) < seconds:
+            done, picture = camera.read()
+            if not done:
+                break
+            rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB).astype(np.float32) / np.float32(255)
+            yield MovieFrame(position, now, rgb)
+            position += 1
+        if position == 0:
+            raise InputError(f"--device {device}: the camera gives no picture")
+    finally:
+        camera.release()

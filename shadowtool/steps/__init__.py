@@ -1,0 +1,1 @@
+"""The six steps as functions: each reads and writes files, and can be called from Python."""

@@ -1,0 +1,166 @@
+"""The figure and its shadow in the target scene."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.choices import Fill, Format
+from shadowtool.core.beta import inpaint
+from shadowtool.core.compositing import over, shade, shadow_ratio
+from shadowtool.core.warp_map import WarpMap, resample
+from shadowtool.errors import InputError
+from shadowtool.io.image import (
+    EXR,
+    PNG,
+    read_header,
+    read_image,
+    to_code,
+    to_half,
+    write_exr,
+    write_png,
+)
+from shadowtool.io.products import read_plates, read_warp
+from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
+from shadowtool.steps.footage import require_size
+from shadowtool.steps.matte import BETA_FOLDER, FIGURE_FOLDER
+from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
+
+logger = logging.getLogger(__name__)
+
+Float32 = NDArray[np.float32]
+RATIO_FOLDER = "ratio"
+
+
+def composite(
+    mattes: Path | None,
+    output: Path,
+    *,
+    plates: Path,
+    run: Run = Run(),
+    warp: Path | None = None,
+    foreground: str | Path | None = None,
+    beta: str | Path | None = None,
+    ratio: bool = False,
+    fill: Fill = "lit",
+    file_format: Format = "exr",
+) -> Result:
+    """Write the composite C' = αF + (1 - α)(β[W]·L' + (1 - β[W])·S').
+
+    Args:
+        mattes: a folder of `matte`, with ``fg/`` and ``beta/``; None if both are given apart.
+        plates: the folder of the target scene's plates.
+        warp: an ST map; without it the shadow stays as it fell in the source.
+        foreground: frames with R, G, B, A, premultiplied, instead of ``fg/``.
+        beta: frames instead of ``beta/``.
+        ratio: write C'/L' without the figure too.
+        fill: what unknown β becomes; "none" leaves NaN.
+
+    Raises:
+        InputError: an input is missing, or pictures differ in size.
+    """
+    figure_frames = open_sequence(foreground or _part(mattes, FIGURE_FOLDER), "figure")
+    beta_frames = open_sequence(beta or _part(mattes, BETA_FOLDER), "β")
+    frames, absent = beta_frames.select(run.frames, run.missing)
+    absent += [f for f in frames if f not in figure_frames.files and run.missing == "skip"]
+    frames = [frame for frame in frames if frame not in absent]
+    stored = read_plates(plates)
+    lit, shadow, repaired = _complete(stored.plates.lit, stored.plates.shadow)
+    header = stored.header
+    for frame in frames:
+        for sequence in (figure_frames, beta_frames):
+            path = sequence.path(frame)
+            require_size(path, read_header(path), header, f"the plates in {plates}")
+    warp_map: WarpMap | None = None
+    shared = [stored.fingerprint]
+    if warp is not None:
+        warp_map, warp_header, mark = read_warp(warp)
+        require_size(warp, warp_header, header, f"the plates in {plates}")
+        shared.append(mark)
+    suffix = EXR if file_format == "exr" else PNG
+    name = output.resolve().name
+    recipe = Recipe(
+        "composite",
+        {"fill": fill, "format": file_format, "ratio": ratio, "warped": warp is not None},
+        {
+            "foreground": Path(figure_frames.pattern).name,
+            "beta": Path(beta_frames.pattern).name,
+            "plates": plates.resolve().name,
+        },
+    )
+    if repaired:
+        logger.warning("%s: %d pixels are unknown in a plate; the other serves", plates, repaired)
+
+    def products(frame: Frame) -> list[Path]:
+        files = [output / frame_file(name, frame, suffix)]
+        if ratio:
+            files.append(output / RATIO_FOLDER / frame_file(RATIO_FOLDER, frame, EXR))
+        return files
+
+    def sources(frame: Frame) -> list[Path]:
+        return [figure_frames.path(frame), beta_frames.path(frame)]
+
+    def make(frame: Frame, provenance: dict[str, str]) -> Figures:
+        visibility, unknown = _visibility(beta_frames, frame, fill)
+        colour, alpha = read_image(figure_frames.path(frame)).rgba()
+        if warp_map is not None:
+            visibility = resample(visibility, warp_map.warp, outside=1.0)
+        shaded = shade(lit, shadow, visibility)
+        result = over(colour, alpha, shaded)
+        figures = {"unknown": unknown}
+        marked = with_figures(provenance, figures)
+        target, *ratios = products(frame)
+        frame_header = read_header(figure_frames.path(frame))
+        if suffix == EXR:
+            write_exr(target, {"RGB": to_half(result)}, frame_header, marked)
+        else:
+            write_png(target, to_code(result), marked)
+        for path in ratios:
+            values = to_half(shadow_ratio(shaded, lit))
+            write_exr(path, {"RGB": values}, frame_header, marked)
+        return figures
+
+    def summary(rows: list[Figures]) -> Figures:
+        return {"unknown": sum(int(row.get("unknown", 0)) for row in rows)}
+
+    work = FrameWork(recipe, output, products, sources, shared, make)
+    return work.run(frames, run, absent, summary)
+
+
+def _part(mattes: Path | None, folder: str) -> Path:
+    if mattes is None:
+        raise InputError("give the folder of a matte, or --fg and --beta-frames")
+    if not mattes.is_dir():
+        raise InputError(f"{mattes}: no such folder for the matte")
+    part = mattes / folder
+    if not part.is_dir():
+        raise InputError(f"{mattes}: has no {folder}/; make it with `shadowtool matte`")
+    return part
+
+
+def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:
+    """β of a frame, (H, W) or (H, W, 3), and how many of its pixels are unknown."""
+    image = read_image(sequence.path(frame))
+    colour = image.layers.get("RGB")
+    values = image.plane("Y") if colour is None else image.rgb("none").astype(np.float32)
+    holes = ~np.isfinite(values)
+    if holes.any():
+        values = np.where(holes, np.float32(np.nan), values)
+        if fill == "lit":
+            values = np.where(holes, np.float32(1), values)
+        elif fill == "inpaint" and values.ndim == 2:
+            values = inpaint(values)
+        elif fill == "inpaint":
+            values = np.dstack([inpaint(values[..., c]) for c in range(3)])
+    return values, int(holes.any(axis=-1).sum() if holes.ndim == 3 else holes.sum())
+
+
+def _complete(lit: Float32, shadow: Float32) -> tuple[Float32, Float32, int]:
+    """Plates without NaN: where one is unknown the other stands in, black where both are."""
+    holes = ~(np.isfinite(lit) & np.isfinite(shadow)).all(axis=-1)
+    if not holes.any():
+        return lit, shadow, 0
+    either = np.where(np.isfinite(lit), lit, np.where(np.isfinite(shadow), shadow, np.float32(0)))
+    whole_shadow = np.where(np.isfinite(shadow), shadow, either)
+    return either, whole_shadow, int(holes.sum())

@@ -1,0 +1,103 @@
+"""Footage: a sequence whose frames are known to fit together, read as linear light."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.choices import Missing
+from shadowtool.core.noise import (
+    NoiseModel,
+    noise_levels,
+    noise_model,
+    sample_positions,
+    thin,
+)
+from shadowtool.errors import DamagedFileError, InputError
+from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
+from shadowtool.io.sequence import Frame, Sequence, open_sequence
+from shadowtool.parallel import ordered_map
+
+
+@dataclass(frozen=True)
+class Footage:
+    """A sequence of pictures of one size.
+
+    Attributes:
+        sequence: the frames' files.
+        header: the first frame's.
+        transfer: the transfer function's name.
+    """
+
+    sequence: Sequence
+    header: Header
+    transfer: str
+
+    def image(self, frame: Frame) -> Image:
+        """Read a frame.
+
+        Raises:
+            InputError, DamagedFileError: it can't be read, or is of another size.
+        """
+        image = read_image(self.sequence.path(frame))
+        require_size(image.path, image.header, self.header, self.sequence.pattern)
+        return image
+
+    def read(self, frame: Frame) -> NDArray[np.floating]:
+        """(H, W, 3) linear light; float16 where the file holds linear halfs."""
+        return self.image(frame).rgb(self.transfer)
+
+    def measure_noise(self, jobs: int | None = None) -> NoiseModel:
+        """The take's noise, from pairs of neighbouring frames spread over the whole of it.
+
+        It does not depend on which frames a run is asked for.
+        """
+        frames = self.sequence.frames
+        positions = sample_positions(len(frames))
+        wanted = [frames[position] for position in positions.values()]
+        thinned = ordered_map(self._sample, wanted, jobs)
+        samples = {number: t for number, t in zip(positions, thinned, strict=True) if t is not None}
+        return noise_model(noise_levels(samples))
+
+    def _sample(self, frame: Frame) -> NDArray[np.float32] | None:
+        try:
+            return thin(self.read(frame))
+        except DamagedFileError:
+            # Said where the frame itself is worked on.
+            return None
+
+
+def open_footage(
+    source: str | Path, role: str = "frames", transfer: str = "auto", missing: Missing = "error"
+) -> Footage:
+    """Open a sequence and look at every header, so that misfits are found before any work.
+
+    Raises:
+        InputError: nothing there, two sequences, mixed sizes, or a kind of file that is refused.
+        DamagedFileError: a header is damaged and ``missing`` is "error".
+    """
+    sequence = open_sequence(source, role)
+    first: Header | None = None
+    for path in sequence.files.values():
+        try:
+            header = read_header(path)
+        except DamagedFileError:
+            if missing == "error":
+                raise
+            continue
+        if first is None:
+            first = header
+        require_size(path, header, first, sequence.pattern)
+    if first is None:
+        raise DamagedFileError(f"{sequence.pattern}: no frame can be read")
+    return Footage(sequence, first, resolve_transfer(transfer, next(iter(sequence.files.values()))))
+
+
+def require_size(path: Path, header: Header, expected: Header, of: str) -> None:
+    """Raise InputError unless the picture is as large as it should be."""
+    if header.size != expected.size:
+        raise InputError(
+            f"{path}: is {header.width}x{header.height}, but {of} is"
+            f" {expected.width}x{expected.height}; give pictures of one size"
+        )

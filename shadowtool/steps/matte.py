@@ -1,0 +1,175 @@
+"""The shadow matte β and the figure's matte, frame by frame."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.choices import Fill, Only
+from shadowtool.core import beta as shadow_beta
+from shadowtool.core.compositing import shade
+from shadowtool.core.matting import (
+    difference_alpha,
+    difference_trimap,
+    line_distance,
+    pull_figure,
+)
+from shadowtool.errors import OptionError
+from shadowtool.io.image import EXR, PNG, read_header, read_image, to_half, write_exr, write_png
+from shadowtool.io.products import read_plates
+from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
+from shadowtool.steps.footage import open_footage, require_size
+from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
+
+Float32 = NDArray[np.float32]
+
+TRIMAP_FOLDER, FIGURE_FOLDER, BETA_FOLDER = "trimap", "fg", "beta"
+
+
+def matte(
+    source: str | Path,
+    output: Path,
+    *,
+    plates: Path,
+    run: Run = Run(),
+    alpha: str | Path | None = None,
+    trimap: str | Path | None = None,
+    only: Only | None = None,
+    fill: Fill = "inpaint",
+    transfer: str = "auto",
+) -> Result:
+    """Write ``trimap/``, ``fg/`` (αF and α) and ``beta/`` (β and its confidence).
+
+    Args:
+        plates: the folder of the source scene's plates.
+        alpha: the figure's matte from elsewhere, used as given; no trimap is then made.
+        trimap: 0, 128, 255 for every frame, used instead of one by difference.
+        only: write one of the three products.
+        fill: what unknown β becomes.
+
+    Raises:
+        InputError: frames, plates, mattes are missing or don't fit.
+    """
+    footage = open_footage(source, "frames", transfer, run.missing)
+    frames, absent = footage.sequence.select(run.frames, run.missing)
+    stored = read_plates(plates)
+    require_size(plates, stored.header, footage.header, footage.sequence.pattern)
+    if alpha is not None and only == "trimap":
+        raise OptionError("--only trimap makes trimaps, which --alpha replaces; give one of them")
+    given = {
+        role: _open_matte(role, path, frames, run)
+        for role, path in (("alpha", alpha), ("trimap", trimap))
+        if path is not None
+    }
+    for sequence in given.values():
+        for frame in frames:
+            path = sequence.path(frame)
+            require_size(path, read_header(path), footage.header, footage.sequence.pattern)
+    noise = footage.measure_noise(run.jobs)
+    scene = stored.plates
+    never_shaded = shadow_beta.unknown_beta(
+        contrast := shadow_beta.shadow_contrast(scene, noise), scene.frames
+    )
+    known_confidence = np.clip(1 - 1 / np.maximum(contrast, 1e-6), 0, 1)
+    known_confidence[never_shaded] = 0
+    recipe = Recipe(
+        "matte",
+        {
+            "fill": fill,
+            "only": only,
+            "transfer": footage.transfer,
+            "noise": [[float(v) for v in row] for row in (noise.slope, noise.floor)],
+        },
+        {"frames": Path(footage.sequence.pattern).name}
+        | {"plates": plates.resolve().name}
+        | {role: Path(sequence.pattern).name for role, sequence in given.items()},
+    )
+
+    def wanted(product: Only) -> bool:
+        if product == "trimap" and "alpha" in given:
+            return False
+        return only in (None, product)
+
+    def file(folder: str, frame: Frame, suffix: str = EXR) -> Path:
+        return output / folder / frame_file(folder, frame, suffix)
+
+    def products(frame: Frame) -> list[Path]:
+        files = []
+        if wanted("trimap"):
+            files.append(file(TRIMAP_FOLDER, frame, PNG))
+        if wanted("alpha"):
+            files.append(file(FIGURE_FOLDER, frame))
+        if wanted("beta"):
+            files.append(file(BETA_FOLDER, frame))
+        return files
+
+    def sources(frame: Frame) -> list[Path]:
+        return [s.path(frame) for s in (footage.sequence, *given.values())]
+
+    def make(frame: Frame, provenance: dict[str, str]) -> Figures:
+        image = footage.read(frame).astype(np.float32)
+        bad = ~np.isfinite(image).all(axis=-1)
+        image[bad] = np.nan
+        if "alpha" in given:
+            coverage = np.clip(_matte_plane(given["alpha"].path(frame)), 0, 1)
+        else:
+            distance = line_distance(image, scene, noise)
+            if "trimap" in given:
+                regions = _trimap_plane(given["trimap"].path(frame))
+            else:
+                regions = difference_trimap(distance)
+            if wanted("trimap"):
+                write_png(file(TRIMAP_FOLDER, frame, PNG), regions, provenance)
+            if only == "trimap":
+                return {}
+            coverage = difference_alpha(distance, regions)
+        hidden = coverage > 0
+        known = np.clip(shadow_beta.shadow_matte(image, scene.lit, scene.shadow), 0, 1)
+        known[never_shaded | hidden] = np.nan
+        unknown = np.isnan(known)
+        filled = shadow_beta.fill_beta(known, never_shaded, hidden, fill)
+        figures = {
+            "unknown": int((unknown & ~hidden).sum()),
+            "hidden": int(hidden.sum()),
+            "not_finite": int(bad.sum()),
+        }
+        if wanted("alpha"):
+            behind = filled if fill != "none" else shadow_beta.inpaint(filled)
+            figure = pull_figure(image, coverage, shade(scene.lit, scene.shadow, behind))
+            rgba = np.dstack([figure.foreground, figure.alpha])
+            marked = with_figures(provenance, figures)
+            write_exr(file(FIGURE_FOLDER, frame), {"RGBA": to_half(rgba)}, footage.header, marked)
+        if wanted("beta"):
+            confidence = np.where(unknown, np.float32(0), known_confidence)
+            layers = {"Y": to_half(filled), "confidence": to_half(confidence)}
+            marked = with_figures(provenance, figures)
+            write_exr(file(BETA_FOLDER, frame), layers, footage.header, marked)
+        return figures
+
+    def summary(rows: list[Figures]) -> Figures:
+        names = ("unknown", "hidden", "not_finite")
+        return {name: sum(int(row.get(name, 0)) for row in rows) for name in names}
+
+    work = FrameWork(recipe, output, products, sources, [stored.fingerprint], make)
+    return work.run(frames, run, absent, summary)
+
+
+def _open_matte(role: str, path: str | Path, frames: list[Frame], run: Run) -> Sequence:
+    sequence = open_sequence(path, role)
+    lacking = [frame for frame in frames if frame not in sequence.files]
+    if lacking and run.missing == "error":
+        sequence.path(lacking[0])
+    return sequence
+
+
+def _matte_plane(path: Path) -> Float32:
+    plane = read_image(path).plane("A", "Y", "R")
+    return np.nan_to_num(plane, nan=0.0)
+
+
+def _trimap_plane(path: Path) -> NDArray[np.uint8]:
+    plane = _matte_plane(path)
+    trimap = np.full(plane.shape, 128, np.uint8)
+    trimap[plane < 0.25] = 0
+    trimap[plane > 0.75] = 255
+    return trimap

@@ -1,0 +1,247 @@
+"""What all steps share: how they are asked to run, what they leave behind, and resuming."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from shadowtool import __version__
+from shadowtool.choices import Missing
+from shadowtool.errors import DamagedFileError, InputError, OutputExistsError
+from shadowtool.io.files import fingerprint_file, make_folder
+from shadowtool.io.image import EXR, read_image
+from shadowtool.io.products import MANIFEST, folder_lock, read_manifest, write_json
+from shadowtool.io.sequence import Frame
+from shadowtool.parallel import ordered_map
+
+Progress = Callable[[int, int], None]
+Figures = dict[str, Any]
+
+
+def no_progress(done: int, total: int) -> None:
+    """Report nothing."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a step is to be run, apart from what it computes.
+
+    Attributes:
+        frames: a frame range, None for all.
+        missing: "error", or "skip" to go on without frames that are absent or damaged.
+        jobs: threads, None for as many as the process may use.
+        overwrite: replace what is there.
+        resume: keep what is there and current, make the rest.
+        progress: called with frames done and frames in all.
+    """
+
+    frames: str | None = None
+    missing: Missing = "error"
+    jobs: int | None = None
+    overwrite: bool = False
+    resume: bool = False
+    progress: Progress = no_progress
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that decides a step's result: the same recipe gives the same bits.
+
+    Attributes:
+        step: the step's name.
+        parameters: values that JSON can hold; no paths, no number of jobs.
+        inputs: what was read, by role, as a person would name it.
+    """
+
+    step: str
+    parameters: Mapping[str, Any]
+    inputs: Mapping[str, str]
+
+    @property
+    def command(self) -> str:
+        words = ["shadowtool", self.step, *self.inputs.values()]
+        for name, value in self.parameters.items():
+            if value is not None and not isinstance(value, (dict, list)):
+                words.append(f"--{name}={value}")
+        return " ".join(words)
+
+    def fingerprint(self, inputs: Iterable[str]) -> str:
+        """Of version, parameters and the fingerprints of what was read."""
+        text = json.dumps([__version__, self.step, self.parameters, list(inputs)], sort_keys=True)
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+    def provenance(self, fingerprint: str) -> dict[str, str]:
+        """What goes into every file that the step writes."""
+        return {"version": __version__, "command": self.command, "fingerprint": fingerprint}
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a step did.
+
+    Attributes:
+        output: the folder that it wrote to.
+        frames: the frames that it wrote, or looked at.
+        kept: how many of them were current and kept.
+        skipped: frames that were missing or damaged, with `Run.missing` "skip".
+        figures: numbers worth knowing, by name.
+    """
+
+    step: str
+    output: Path
+    frames: Sequence[Frame]
+    kept: int = 0
+    skipped: Sequence[Frame] = ()
+    figures: Figures = field(default_factory=dict)
+
+
+def refuse_existing(files: Iterable[Path], run: Run) -> None:
+    """Stop before anything is replaced that nobody asked to replace.
+
+    Raises:
+        OutputExistsError: a file is there, and neither overwriting nor resuming is wanted.
+    """
+    if run.overwrite or run.resume:
+        return
+    there = [file for file in files if file.exists()]
+    if there:
+        more = f" and {len(there) - 1} more" if len(there) > 1 else ""
+        raise OutputExistsError(
+            f"{there[0]}{more}: exists already; give --overwrite to replace or --resume to go on"
+        )
+
+
+@dataclass(frozen=True)
+class FrameWork:
+    """One step's work on single frames.
+
+    Attributes:
+        recipe: what decides the result.
+        output: the step's folder.
+        products: the files that a frame becomes.
+        sources: the files that a frame is made of.
+        shared: fingerprints of what all frames depend on.
+        make: writes the products with the given provenance, returns the frame's figures.
+    """
+
+    recipe: Recipe
+    output: Path
+    products: Callable[[Frame], list[Path]]
+    sources: Callable[[Frame], list[Path]]
+    shared: list[str]
+    make: Callable[[Frame, dict[str, str]], Figures]
+
+    def run(
+        self,
+        frames: Sequence[Frame],
+        run: Run,
+        absent: Sequence[Frame] = (),
+        summary: Callable[[list[Figures]], Figures] = lambda rows: {},
+    ) -> Result:
+        """Make all the frames and write the manifest.
+
+        Args:
+            absent: frames that are missing from the input.
+            summary: from the figures of all the frames that the manifest knows.
+        """
+        refuse_existing((file for frame in frames for file in self.products(frame)), run)
+        for folder in {file.parent for frame in frames for file in self.products(frame)}:
+            make_folder(folder)
+        make_folder(self.output)
+        run.progress(0, len(frames))
+        rows: dict[str, Figures] = {}
+        skipped, kept = list(absent), 0
+        results = ordered_map(lambda frame: self._frame(frame, run), frames, run.jobs)
+        for number, (frame, outcome) in enumerate(zip(frames, results, strict=True), start=1):
+            if outcome is None:
+                skipped.append(frame)
+            else:
+                rows[str(frame)] = outcome[0]
+                kept += outcome[1]
+            run.progress(number, len(frames))
+        figures = self._record(rows, summary)
+        done = [frame for frame in frames if str(frame) in rows]
+        return Result(self.recipe.step, self.output, done, kept, skipped, figures)
+
+    def _frame(self, frame: Frame, run: Run) -> tuple[Figures, bool] | None:
+        try:
+            inputs = [fingerprint_file(path) for path in self.sources(frame)]
+            mark = self.recipe.fingerprint([*self.shared, *inputs])
+            if run.resume and (figures := _current(self.products(frame), mark)) is not None:
+                return {"fingerprint": mark, **figures}, True
+            figures = self.make(frame, self.recipe.provenance(mark))
+        except (DamagedFileError, InputError):
+            if run.missing == "skip":
+                return None
+            raise
+        return {"fingerprint": mark, **figures}, False
+
+    def _record(
+        self, rows: dict[str, Figures], summary: Callable[[list[Figures]], Figures]
+    ) -> Figures:
+        key = self.recipe.fingerprint(self.shared)
+        with folder_lock(self.output):
+            before = read_manifest(self.output)
+            if before.get("fingerprint") == key and isinstance(before.get("frames"), dict):
+                rows = {**before["frames"], **rows}
+            figures = summary(list(rows.values()))
+            write_manifest(self.output, self.recipe, key, figures, rows)
+        return figures
+
+
+def with_figures(provenance: dict[str, str], figures: Figures) -> dict[str, str]:
+    """Provenance that carries a frame's figures, so that resuming finds them again."""
+    return {**provenance, "figures": json.dumps(figures, sort_keys=True)}
+
+
+def _current(files: list[Path], mark: str) -> Figures | None:
+    """The figures of products that are whole and made of the same; None if they aren't."""
+    figures: Figures = {}
+    for file in files:
+        if not file.is_file():
+            return None
+        try:
+            provenance = read_image(file).header.provenance
+            if provenance.get("fingerprint") != mark:
+                return None
+            figures.update(json.loads(provenance.get("figures", "{}")))
+        except (InputError, ValueError):
+            return None
+    return figures
+
+
+def unchanged(output: Path, products: Iterable[Path], mark: str) -> Figures | None:
+    """For steps with one result: the figures of an earlier run that can be kept, else None."""
+    manifest = read_manifest(output)
+    if manifest.get("fingerprint") != mark:
+        return None
+    if _current([file for file in products if file.suffix == EXR], mark) is None:
+        return None
+    if not all(file.is_file() for file in products):
+        return None
+    figures = manifest.get("figures", {})
+    return figures if isinstance(figures, dict) else {}
+
+
+def write_manifest(
+    output: Path,
+    recipe: Recipe,
+    mark: str,
+    figures: Figures,
+    frames: Mapping[str, Any] | None = None,
+) -> None:
+    """The last act of every step: the record that a Makefile can depend on."""
+    record = {
+        "step": recipe.step,
+        "version": __version__,
+        "command": recipe.command,
+        "parameters": dict(recipe.parameters),
+        "inputs": dict(recipe.inputs),
+        "fingerprint": mark,
+        "figures": figures,
+    }
+    if frames is not None:
+        record["frames"] = dict(frames)
+    write_json(output / MANIFEST, record)

@@ -1,0 +1,194 @@
+"""Shadow times and shadow lines of one sweep."""
+
+import logging
+import math
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.noise import NoiseModel
+from shadowtool.core.pictures import time_picture
+from shadowtool.core.shadow_lines import NoLinesError, ShadowLines, fit_shadow_lines
+from shadowtool.core.shadow_time import (
+    CrossingTimes,
+    LuminanceRange,
+    ShadowTimes,
+    least_contrast,
+    luminance,
+)
+from shadowtool.core.warp_map import Pass, line_speed
+from shadowtool.errors import DamagedFileError, InputError, OptionError, ReshootError
+from shadowtool.io.files import fingerprint_file, make_folder
+from shadowtool.io.image import Header, read_image, write_png
+from shadowtool.io.products import LINES, MANIFEST, SCAN, write_scan
+from shadowtool.io.sequence import Frame
+from shadowtool.parallel import ordered_map
+from shadowtool.steps.footage import Footage, open_footage, require_size
+from shadowtool.steps.run import (
+    Figures,
+    Recipe,
+    Result,
+    Run,
+    refuse_existing,
+    unchanged,
+    write_manifest,
+)
+
+logger = logging.getLogger(__name__)
+
+Float32 = NDArray[np.float32]
+PICTURE = "scan.png"
+_POINT = re.compile(r"-?\d+(?:\.\d+)?,-?\d+(?:\.\d+)?")
+
+
+def scan(
+    source: str | Path,
+    output: Path,
+    *,
+    plane: str,
+    run: Run = Run(),
+    transfer: str = "auto",
+) -> Result:
+    """Write ``scan.exr`` (time, contrast), ``lines.json`` and a picture of both.
+
+    Args:
+        plane: the reference plane region: a mask image (above half is inside), or a polygon
+            ``x,y x,y x,y …`` in pixels.
+
+    Raises:
+        InputError: frames or mask are missing or don't fit.
+        OptionError: the polygon can't be read.
+        ReshootError: the plane shows too little of the sweep.
+    """
+    footage = open_footage(source, "frames", transfer, run.missing)
+    frames, absent = footage.sequence.select(run.frames, run.missing)
+    if len(frames) < 3:
+        raise InputError(f"{footage.sequence.pattern}: {len(frames)} frames make no sweep")
+    region, plane_mark = read_plane(plane, footage.header)
+    products = [output / SCAN, output / LINES]
+    refuse_existing([*products, output / MANIFEST], run)
+    recipe = Recipe(
+        "scan",
+        {"transfer": footage.transfer},
+        {"frames": Path(footage.sequence.pattern).name, "plane": plane_mark},
+    )
+    if run.resume:
+        paths = [footage.sequence.path(frame) for frame in frames]
+        mark = recipe.fingerprint([plane_mark, *ordered_map(fingerprint_file, paths, run.jobs)])
+        figures = unchanged(output, products, mark)
+        if figures is not None:
+            return Result("scan", output, frames, len(frames), absent, figures)
+    noise = footage.measure_noise(run.jobs)
+    times, marks, used, first = _times(footage, frames, noise, run)
+    skipped = [*absent, *(frame for frame in frames if frame not in used)]
+    numbers = np.array([float(frame) for frame in used])
+    if numbers[-1] > 2**20:
+        logger.warning(
+            "%s: frame numbers this large leave float32 times few digits; renumber the take",
+            footage.sequence.pattern,
+        )
+    try:
+        lines = fit_shadow_lines(times.time, region, numbers)
+    except NoLinesError as error:
+        raise ReshootError(
+            f"{footage.sequence.pattern}: reshoot: {error}; sweep the shadow across the plane,"
+            " or mark a larger plane"
+        ) from None
+    figures = _figures(times, lines, used)
+    mark = recipe.fingerprint([plane_mark, *marks])
+    provenance = recipe.provenance(mark)
+    make_folder(output)
+    write_scan(output, Pass(times, lines), footage.header, provenance)
+    write_png(output / PICTURE, time_picture(first, times.time, lines, region), provenance)
+    write_manifest(output, recipe, mark, figures)
+    return Result("scan", output, used, 0, skipped, figures)
+
+
+def read_plane(plane: str, header: Header) -> tuple[NDArray[np.bool_], str]:
+    """The reference plane region (H, W) and a fingerprint of it.
+
+    Raises:
+        InputError: no such mask, or of another size.
+        OptionError: a polygon of fewer than three points, or outside the picture.
+    """
+    words = plane.split()
+    if words and all(_POINT.fullmatch(word) for word in words):
+        if len(words) < 3:
+            raise OptionError(f"--plane {plane}: a polygon takes three points or more")
+        points = np.array([[float(v) for v in word.split(",")] for word in words])
+        region = np.zeros((header.height, header.width), np.uint8)
+        corners = np.rint(np.clip(points, -1e6, 1e6)).astype(np.int32)
+        cv2.fillPoly(region, [corners], 255)
+        name = " ".join(words)
+    else:
+        image = read_image(Path(plane))
+        require_size(image.path, image.header, header, "the footage")
+        region = (image.plane("A", "Y", "G") > 0.5).astype(np.uint8)
+        name = image.fingerprint
+    if not region.any():
+        raise OptionError(f"--plane {plane}: no pixel of the picture lies inside")
+    return region > 0, name
+
+
+def _times(
+    footage: Footage, frames: list[Frame], noise: NoiseModel, run: Run
+) -> tuple[ShadowTimes, list[str], list[Frame], NDArray[np.floating]]:
+    """Two readings of the pass: its range, then its crossings."""
+
+    def read(frame: Frame) -> tuple[Float32, str] | None:
+        try:
+            image = footage.image(frame)
+        except DamagedFileError:
+            if run.missing == "skip":
+                return None
+            raise
+        return luminance(image.rgb(footage.transfer)), image.fingerprint
+
+    total = 2 * len(frames)
+    run.progress(0, total)
+    span, marks, used = LuminanceRange(), [], []
+    for number, (frame, item) in enumerate(
+        zip(frames, ordered_map(read, frames, run.jobs), strict=True), start=1
+    ):
+        run.progress(number, total)
+        if item is not None:
+            span.add(item[0])
+            marks.append(item[1])
+            used.append(frame)
+    if span.lowest is None or span.highest is None or len(used) < 3:
+        raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
+    least = least_contrast(span.highest, span.frames, noise)
+    crossings = CrossingTimes(span.lowest, span.highest, least)
+    for number, (frame, item) in enumerate(
+        zip(used, ordered_map(read, used, run.jobs), strict=True), start=len(frames) + 1
+    ):
+        if item is not None:
+            crossings.add(float(frame), item[0])
+        run.progress(number, total)
+    run.progress(total, total)
+    return crossings.times(), marks, used, footage.read(used[0])
+
+
+def _figures(times: ShadowTimes, lines: ShadowLines, frames: list[Frame]) -> Figures:
+    speed = line_speed(lines, times.time.shape)
+    turned = math.degrees(float(lines.angle[-1] - lines.angle[0]))
+    origins = list(lines.origin)
+    return {
+        "frames": len(frames),
+        "reached": round(float(np.isfinite(times.time).mean()), 4),
+        "lines": {
+            "first": float(lines.frame[0]),
+            "last": float(lines.frame[-1]),
+            **{origin: origins.count(origin) for origin in ("fit", "refit", "interpolated")},
+        },
+        "residual": {
+            "median": round(float(np.median(lines.residual)), 4),
+            "largest": round(float(lines.residual.max()), 4),
+        },
+        "pixels_per_frame": round(float(np.median(speed)), 3),
+        "direction_degrees": round(math.degrees(float(lines.angle[len(lines) // 2])) % 360, 2),
+        "turned_degrees": round(turned, 2),
+    }

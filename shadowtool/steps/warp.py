@@ -1,0 +1,196 @@
+"""The displacement map from scans, and frames seen through it."""
+
+import logging
+import math
+from pathlib import Path
+
+import numpy as np
+
+from shadowtool.core.diffusion import diffuse
+from shadowtool.core.pictures import warp_picture
+from shadowtool.core.warp_map import (
+    LEAST_ANGLE,
+    Pass,
+    WarpMap,
+    identity_map,
+    intersect,
+    pass_angles,
+    resample,
+)
+from shadowtool.errors import OptionError, ReshootError
+from shadowtool.io.files import make_folder
+from shadowtool.io.image import EXR, Header, read_header, read_image, to_half, write_exr, write_png
+from shadowtool.io.products import MANIFEST, WARP, read_scan, read_warp, write_warp
+from shadowtool.io.sequence import Frame, frame_file, open_sequence
+from shadowtool.steps.footage import require_size
+from shadowtool.steps.run import (
+    Figures,
+    FrameWork,
+    Recipe,
+    Result,
+    Run,
+    refuse_existing,
+    unchanged,
+    write_manifest,
+)
+
+logger = logging.getLogger(__name__)
+
+PICTURE = "warp.png"
+
+
+def solve_warp(
+    scans: list[Path], output: Path, *, run: Run = Run(), iterations: int = 40
+) -> Result:
+    """Write ``warp.exr`` and a picture of it.
+
+    Args:
+        scans: two or more folders of `scan`.
+        iterations: of the diffusion; 0 only fills.
+
+    Raises:
+        InputError: a scan is missing, or sizes differ.
+        ReshootError: the passes can't fix any point.
+    """
+    if len(scans) < 2:
+        raise OptionError("a map takes two scans or more, swept at different angles")
+    read = [read_scan(folder) for folder in scans]
+    header = read[0][1]
+    for folder, (_, other, _) in zip(scans, read, strict=True):
+        require_size(folder, other, header, str(scans[0]))
+    refuse_existing([output / WARP, output / MANIFEST], run)
+    recipe = Recipe(
+        "warp",
+        {"iterations": iterations},
+        {f"scan {i}": folder.resolve().name for i, folder in enumerate(scans, start=1)},
+    )
+    mark = recipe.fingerprint(fingerprint for _, _, fingerprint in read)
+    if run.resume:
+        figures = unchanged(output, [output / WARP], mark)
+        if figures is not None:
+            return Result("warp", output, [], 1, (), figures)
+    passes = [scan for scan, _, _ in read]
+    angles = pass_angles(passes)
+    widest = max(angles, key=lambda row: row[2])
+    if widest[2] < LEAST_ANGLE:
+        raise ReshootError(
+            f"{scans[widest[0]]} and {scans[widest[1]]}: reshoot: the sweeps are only"
+            f" {math.degrees(widest[2]):.1f} degrees apart; turn the stick by 45 or more"
+        )
+    run.progress(0, 2)
+    measured = intersect(passes)
+    if not np.isfinite(measured.error).any():
+        raise ReshootError(f"{output}: reshoot: no pixel was reached by two sweeps")
+    run.progress(1, 2)
+    solved = diffuse(measured, iterations)
+    run.progress(2, 2)
+    figures = _figures(passes, measured, scans)
+    provenance = recipe.provenance(mark)
+    make_folder(output)
+    write_warp(output / WARP, solved, header, provenance)
+    write_png(output / PICTURE, _picture(passes, solved), provenance)
+    write_manifest(output, recipe, mark, figures)
+    return Result("warp", output, [], 0, (), figures)
+
+
+def apply_warp(
+    map_file: Path,
+    source: str | Path,
+    output: Path,
+    *,
+    run: Run = Run(),
+    outside: float = 1.0,
+    record_in: Path | None = None,
+) -> Result:
+    """Write frames as the map sees them, under ``NAME/NAME.1001.exr``; NAME is the input's.
+
+    Every channel is resampled bilinearly; the map's size is the result's. Colour is resampled as
+    stored, so encoded footage should be captured to linear light first.
+
+    Args:
+        outside: the value where the map points outside the frame; 1 is lit.
+        record_in: the folder of the manifest, by default that of the frames.
+
+    Raises:
+        InputError: map or frames are missing.
+    """
+    warp_map, header, map_mark = read_warp(map_file)
+    frames_in = open_sequence(source, "frames to warp")
+    frames, absent = frames_in.select(run.frames, run.missing)
+    for frame in frames:
+        read_header(frames_in.path(frame))
+    folder = output / frames_in.name
+    recipe = Recipe(
+        "warp",
+        {"outside": outside},
+        {"map": map_file.name, "frames": Path(frames_in.pattern).name},
+    )
+
+    def products(frame: Frame) -> list[Path]:
+        return [folder / frame_file(frames_in.name, frame, EXR)]
+
+    def make(frame: Frame, provenance: dict[str, str]) -> Figures:
+        image = read_image(frames_in.path(frame))
+        scaled = _scaled(warp_map, header, image.header)
+        layers = {}
+        for name, values in image.layers.items():
+            edge = 0.0 if name == "confidence" else outside
+            plain = image.rgb("none") if values.dtype.kind == "u" and values.ndim == 3 else values
+            single = image.plane(name) if values.ndim == 2 else plain
+            warped = resample(single, scaled, edge)
+            layers[name] = warped if values.dtype == np.float32 else to_half(warped)
+        write_exr(products(frame)[0], layers, image.header, provenance)
+        return {}
+
+    work = FrameWork(
+        recipe,
+        record_in or folder,
+        products,
+        lambda frame: [frames_in.path(frame)],
+        [map_mark],
+        make,
+    )
+    return work.run(frames, run, absent)
+
+
+def _scaled(warp_map: WarpMap, header: Header, source: Header) -> np.ndarray:
+    """W for a source picture of another size than the map's: an ST map knows no size."""
+    if source.size == header.size:
+        return warp_map.warp
+    factor = np.array(source.size, np.float32) / np.array(header.size, np.float32)
+    return ((warp_map.warp + 0.5) * factor - 0.5).astype(np.float32)
+
+
+def _figures(passes: list[Pass], measured: WarpMap, scans: list[Path]) -> Figures:
+    names = [folder.resolve().name for folder in scans]
+    known = np.isfinite(measured.error)
+    error = measured.error[known]
+    displacement = np.linalg.norm(
+        measured.warp[known] - identity_map(*measured.error.shape)[known], axis=-1
+    )
+    return {
+        "reached": {
+            name: round(float(np.isfinite(scan.times.time).mean()), 4)
+            for name, scan in zip(names, passes, strict=True)
+        },
+        "known": round(float(known.mean()), 4),
+        "filled": round(float(1 - known.mean()), 4),
+        "angles_degrees": {
+            f"{names[i]} {names[j]}": round(math.degrees(angle), 1)
+            for i, j, angle in pass_angles(passes)
+        },
+        "predicted_error": {
+            "median": round(float(np.median(error)), 3),
+            "p90": round(float(np.percentile(error, 90)), 3),
+        },
+        "displacement": {
+            "median": round(float(np.median(displacement)), 3),
+            "p99": round(float(np.percentile(displacement, 99)), 3),
+        },
+    }
+
+
+def _picture(passes: list[Pass], solved: WarpMap) -> np.ndarray:
+    contrast = np.max([scan.times.contrast for scan in passes], axis=0)
+    gray = contrast / max(float(np.percentile(contrast, 99)), 1e-6) * 0.5
+    return warp_picture(np.repeat(gray[..., None], 3, axis=-1), solved)

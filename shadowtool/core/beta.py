@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Fill
+from shadowtool.core.filling import fill_membrane
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plates import Plates
 
@@ -13,6 +14,8 @@ Bool = NDArray[np.bool_]
 
 # A hole of more than this part of the frame is no hole but a region that the shadow never reached.
 _LARGEST_HOLE = 0.005
+# Below this many standard deviations between L and S, β would be off by more than 0.1.
+_LEAST_CONTRAST = 10.0
 
 
 def shadow_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> Float32:
@@ -67,15 +70,18 @@ def unknown_beta(contrast: Float32, frames: NDArray[np.uint32] | None) -> Bool:
     Returns:
         (H, W) bool, true where the contrast is NaN too.
     """
-    least = np.float32(8) if frames is None else np.maximum(extreme_range(frames), 8)
-    return ~(contrast > least)
+    if frames is None:
+        return ~(contrast > _LEAST_CONTRAST)
+    # Each channel has extremes of its own, and the contrast is the root of the sum of squares.
+    least = np.maximum(np.sqrt(np.float32(3)) * extreme_range(frames), _LEAST_CONTRAST)
+    return np.asarray(~(contrast > least))
 
 
 def fill_beta(beta: Float32, never_shaded: Bool, hidden: Bool, fill: Fill) -> Float32:
     """Give unknown pixels a value.
 
     With ``lit`` they become 1. With ``inpaint`` small unknown patches and what the figure hides
-    are continued from around them (Telea's method), and large regions that the shadow never
+    are continued from around them, and large regions that the shadow never
     reached in the whole take become 1: nothing there is in shadow in this frame either. With
     ``none`` they stay NaN.
 
@@ -109,28 +115,13 @@ def inpaint(image: Float32) -> Float32:
     Returns:
         (H, W) float32 without NaN, known pixels unchanged.
     """
-    holes = np.isnan(image)
-    if not holes.any():
+    known = np.isfinite(image)
+    if known.all():
         return image
-    if holes.all():
+    if not known.any():
         return np.ones_like(image)
-    filled = np.where(holes, np.float32(0), image)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(holes.astype(np.uint8))
-    height, width = image.shape
-    margin = 6
-    for label in range(1, count):
-        x, y, w, h, _ = boxes[label]
-        rows = slice(max(y - margin, 0), min(y + h + margin, height))
-        columns = slice(max(x - margin, 0), min(x + w + margin, width))
-        patch = np.ascontiguousarray(filled[rows, columns])
-        # Other holes in the patch are holes here too: their zeros are no values.
-        mask = np.ascontiguousarray(holes[rows, columns]).astype(np.uint8)
-        if mask.all():
-            continue
-        own = labels[rows, columns] == label
-        filled[rows, columns][own] = cv2.inpaint(patch, mask, 3, cv2.INPAINT_TELEA)[own]
-    low, high = np.nanmin(image), np.nanmax(image)
-    return np.where(holes, np.clip(filled, low, high), image).astype(np.float32)
+    values = np.where(known, image, np.float32(0))[..., np.newaxis]
+    return fill_membrane(values, known.astype(np.float32))[..., 0]
 
 
 def _small(mask: Bool) -> Bool:

@@ -4,11 +4,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+Float32 = NDArray[np.float32]
+
 # Larger frames are measured at this width; the result is in pixels of the full frame.
 _WIDTH = 640
+_TILES = 4, 3
+_LEAST_TILE = 24
+# A tile whose best correlation is below this shows something else than before.
+_LEAST_CORRELATION = 0.5
 
 
-def prepare(gray: NDArray[np.float32]) -> NDArray[np.float32]:
+def prepare(gray: Float32) -> Float32:
     """Make (H, W) linear luminance ready for `shift`: small, and blind to slow shading.
 
     The logarithm's local contrast looks the same in light and in shadow.
@@ -16,7 +22,7 @@ def prepare(gray: NDArray[np.float32]) -> NDArray[np.float32]:
     height, width = gray.shape
     if width > _WIDTH:
         size = (_WIDTH, max(1, round(height * _WIDTH / width)))
-        gray = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+        gray = np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.float32)
     level = np.log(np.maximum(np.nan_to_num(gray, nan=0.0, posinf=1e4, neginf=0.0), 1e-3))
     smooth = cv2.GaussianBlur(level.astype(np.float32), (0, 0), 1.0)
     detail = smooth - cv2.GaussianBlur(smooth, (0, 0), 6.0)
@@ -25,10 +31,11 @@ def prepare(gray: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.clip(detail, -spread, spread), np.float32)
 
 
-def shift(reference: NDArray[np.float32], other: NDArray[np.float32], width: int) -> float | None:
+def shift(reference: Float32, other: Float32, width: int) -> float | None:
     """Length of the translation from one prepared frame to another.
 
-    Enhanced correlation coefficient maximisation (Evangelidis and Psarakis 2008).
+    The median over a grid of tiles, so that what moves in the scene is outvoted; each tile by
+    maximising the enhanced correlation coefficient (Evangelidis and Psarakis 2008).
 
     Args:
         reference, other: from `prepare`, of one size.
@@ -37,11 +44,37 @@ def shift(reference: NDArray[np.float32], other: NDArray[np.float32], width: int
     Returns:
         Pixels of the full frame; None where the picture has too little texture to tell.
     """
+    shifts = [
+        tile_shift
+        for one, two in zip(_tiles(reference), _tiles(other), strict=True)
+        if (tile_shift := _tile_shift(one, two)) is not None
+    ]
+    if not shifts:
+        return None
+    x, y = np.median(shifts, axis=0)
+    return float(np.hypot(x, y) * width / reference.shape[1])
+
+
+def _tiles(image: Float32) -> list[Float32]:
+    height, width = image.shape
+    columns = max(1, min(_TILES[0], width // _LEAST_TILE))
+    rows = max(1, min(_TILES[1], height // _LEAST_TILE))
+    return [
+        np.ascontiguousarray(tile)
+        for strip in np.array_split(image, rows, axis=0)
+        for tile in np.array_split(strip, columns, axis=1)
+    ]
+
+
+def _tile_shift(reference: Float32, other: Float32) -> tuple[float, float] | None:
     matrix = np.eye(2, 3, dtype=np.float32)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-4)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 1e-4)
     try:
-        cv2.findTransformECC(reference, other, matrix, cv2.MOTION_TRANSLATION, criteria)
+        correlation, _ = cv2.findTransformECC(
+            reference, other, matrix, cv2.MOTION_TRANSLATION, criteria
+        )
     except cv2.error:
         return None
-    scale = width / reference.shape[1]
-    return float(np.hypot(matrix[0, 2], matrix[1, 2]) * scale)
+    if correlation < _LEAST_CORRELATION:
+        return None
+    return float(matrix[0, 2]), float(matrix[1, 2])

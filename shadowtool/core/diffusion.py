@@ -3,10 +3,10 @@
 Perona and Malik 1990, with the flow from pixels that can be trusted to pixels that can't.
 """
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.filling import fill_membrane
 from shadowtool.core.warp_map import WarpMap, identity_map
 
 Float32 = NDArray[np.float32]
@@ -36,7 +36,7 @@ def diffuse(
     if unknown.all():
         return warp_map
     trust = np.where(unknown, np.float32(1e-3), warp_map.confidence).astype(np.float32)
-    displacement = fill_by_pyramid(
+    displacement = fill_membrane(
         np.where(unknown[..., np.newaxis], np.float32(0), warp_map.warp - identity),
         np.where(unknown, np.float32(0), warp_map.confidence),
     )
@@ -57,33 +57,3 @@ def diffuse(
                 change[:, 1:] -= flow_to_other
         displacement += np.float32(rate) * change
     return WarpMap(identity + displacement, np.where(unknown, np.float32(np.inf), warp_map.error))
-
-
-def fill_by_pyramid(values: Float32, weight: Float32) -> Float32:
-    """Fill pixels of no weight with the weighted mean of the nearest ones (pull and push).
-
-    Args:
-        values: (H, W, C) float32.
-        weight: (H, W) float32 ≥ 0; pixels above 0 keep their values.
-
-    Returns:
-        (H, W, C) float32; all 0 if no pixel has any weight.
-    """
-    height, width = weight.shape
-    known = weight > 0
-    if known.all() or min(height, width) <= 1:
-        if known.any():
-            mean = (values * weight[..., None]).sum(axis=(0, 1)) / weight.sum()
-            return np.where(known[..., None], values, mean).astype(np.float32)
-        return np.zeros_like(values)
-    half = ((width + 1) // 2, (height + 1) // 2)
-    small_weight = cv2.resize(weight, half, interpolation=cv2.INTER_AREA)
-    small_sum = cv2.resize(values * weight[..., None], half, interpolation=cv2.INTER_AREA)
-    small_sum = small_sum.reshape(half[1], half[0], -1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        small = np.where(
-            small_weight[..., None] > 0, small_sum / small_weight[..., None], np.float32(0)
-        ).astype(np.float32)
-    small = fill_by_pyramid(small, np.asarray(small_weight, np.float32))
-    large = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.where(known[..., None], values, large.reshape(values.shape)).astype(np.float32)

@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-# 70% of the |x| of a standard normal x lie below this. The median would bear more motion, but a
-# compressed movie repeats half of its pixels from frame to frame.
-_QUANTILE, _QUANTILE_SIGMA = 0.7, 1.0364334
+# Quantiles of |x| for a standard normal x. Of distant frames a smaller part is trusted, as more
+# has moved between them.
+_NEAR, _FAR = (0.5, 0.6744898), (0.3, 0.3853205)
+# Of normal noise 8% of the differences are below a tenth of a standard deviation. A codec repeats
+# pixels if more than this part is.
+_FROZEN = 0.2
 _LEVELS = 12
 _GRID = 10_000
 _SAMPLES = 8
@@ -107,11 +110,11 @@ class NoiseSamples:
         return {2 * k + place: image for k, pair in pairs for place, image in pair.items()}
 
 
-def noise_levels(samples: Mapping[int, NDArray[np.floating]]) -> list[NoiseLevel]:
+def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
     """The noise against brightness.
 
-    Neighbouring frames tell sensor noise; frames far apart tell besides what a codec hides, which
-    repeats a pixel's noise until it sends the pixel anew. The larger counts.
+    From neighbouring frames. A codec may repeat a pixel's noise until it sends the pixel anew;
+    then frames far apart are compared.
 
     Args:
         samples: thinned frames under the running numbers of `sample_positions`; any may be absent.
@@ -122,15 +125,14 @@ def noise_levels(samples: Mapping[int, NDArray[np.floating]]) -> list[NoiseLevel
     near = [(a, a + 1) for a in samples if a % 2 == 0 and a + 1 in samples]
     firsts = sorted(a for a in samples if a % 2 == 0)
     far = [(a, b) for a, b in combinations(firsts, 2) if b - a >= len(firsts) // 2]
-    measured = [
-        np.quantile(rows, part, axis=0)
-        for pairs, part in ((near, 0.5), (far, _FAR_QUANTILE))
-        if (rows := _spreads([(samples[a], samples[b]) for a, b in pairs]))
-    ]
+    measured = _spreads([(samples[a], samples[b]) for a, b in near], _NEAR)
     if not measured:
         return []
-    values = measured[0][0]
-    sigmas = np.max([row[1] for row in measured], axis=0)
+    values, sigmas, frozen = np.median(measured, axis=0)
+    if np.median(frozen) > _FROZEN and (
+        distant := _spreads([(samples[a], samples[b]) for a, b in far], _FAR)
+    ):
+        values, sigmas, _ = np.quantile(distant, _FAR_QUANTILE, axis=0)
     return [
         NoiseLevel(channel, float(values[level, channel]), float(sigmas[level, channel]))
         for channel in range(3)
@@ -156,8 +158,9 @@ def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
     return NoiseModel(slope, np.maximum(floor, least**2))
 
 
-def _spreads(pairs: list[tuple[NDArray[np.floating], NDArray[np.floating]]]) -> list[Float64]:
-    """For each pair of thinned frames (2, levels, 3): brightness and standard deviation."""
+def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) -> list[Float64]:
+    """For each pair of thinned frames (3, levels, 3): brightness, standard deviation, and the part
+    of the differences that are next to nothing."""
     spreads = []
     for first, second in pairs:
         usable = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
@@ -165,16 +168,18 @@ def _spreads(pairs: list[tuple[NDArray[np.floating], NDArray[np.floating]]]) -> 
             continue
         # By the brighter of the two: a pixel that the shadow covers in one of them alone, which
         # says nothing of the noise, is then among the lit ones, where it is in the minority.
-        level_of = np.maximum(first[usable], second[usable])
-        difference = np.abs(first[usable] - second[usable])
-        spread = np.empty((2, _LEVELS, 3))
+        brighter = np.maximum(first[usable], second[usable])
+        # The variance of a difference is twice that of one frame.
+        difference = np.abs(first[usable] - second[usable]) / np.float32(np.sqrt(2))
+        spread = np.empty((3, _LEVELS, 3))
         for channel in range(3):
-            order = np.argsort(level_of[:, channel], kind="stable")
-            for level, part in enumerate(np.array_split(order, _LEVELS)):
-                spread[0, level, channel] = np.median(level_of[part, channel])
-                # The variance of a difference is twice that of one frame.
-                wide = np.quantile(difference[part, channel], _QUANTILE)
-                spread[1, level, channel] = wide / _QUANTILE_SIGMA / np.sqrt(2)
+            order = np.argsort(brighter[:, channel], kind="stable")
+            for level, rows in enumerate(np.array_split(order, _LEVELS)):
+                own = difference[rows, channel]
+                median = np.median(own) / _NEAR[1]
+                spread[0, level, channel] = np.median(brighter[rows, channel])
+                spread[1, level, channel] = np.quantile(own, part[0]) / part[1]
+                spread[2, level, channel] = (own <= 0.1 * median).mean()
         spreads.append(spread)
     return spreads
 

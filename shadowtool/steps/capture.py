@@ -1,7 +1,8 @@
 """Footage from a movie, a sequence or a camera to numbered linear frames, and what it is worth."""
 
 import logging
-from collections.abc import Iterator
+import uuid
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -17,7 +18,7 @@ from shadowtool.core.noise import NoiseSamples, noise_levels
 from shadowtool.core.shadow_time import luminance
 from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import InputError, OptionError, ReshootError
-from shadowtool.io.files import make_folder
+from shadowtool.io.files import fingerprint_file, fingerprint_movie, make_folder
 from shadowtool.io.image import (
     EXR,
     PNG,
@@ -28,12 +29,12 @@ from shadowtool.io.image import (
     write_exr,
     write_png,
 )
-from shadowtool.io.products import write_json
+from shadowtool.io.products import MANIFEST, read_manifest, write_json
 from shadowtool.io.sequence import Frame, frame_file, frame_range, parse_frames
 from shadowtool.io.video import Movie, MovieFrame, camera_frames, is_movie
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import Footage, open_footage
-from shadowtool.steps.run import Recipe, Result, Run, refuse_existing, write_manifest
+from shadowtool.steps.run import Recipe, Result, Run, current, refuse_existing, write_manifest
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ RECORD = "capture.json"
 FIRST_FRAME = 1001
 # A camera counts as moved from here on, pixels.
 _MOVED = 0.25
-# Neighbouring frames this much more alike than is usual in the take are the same picture twice.
+# Neighbouring frames this much more alike than those around are the same picture twice.
 _DOUBLED = 0.05
 _GRID = 8
 # The part of the record that is shown when the step is done.
@@ -68,6 +69,7 @@ class _Taken:
     seconds: float | None
     values: NDArray[np.floating]
     linear: bool
+    fingerprint: str
 
 
 @dataclass
@@ -75,6 +77,7 @@ class _Source:
     """Where frames come from, and what is known of it beforehand."""
 
     name: str
+    fingerprint: str
     header: Header
     transfer: str
     assumed: list[str]
@@ -106,11 +109,14 @@ class _Report:
             self.seconds.append((taken.frame, taken.seconds))
 
     def doubled(self) -> list[Frame]:
-        """Frames that repeat the one before."""
-        if not self.likeness:
-            return []
-        usual = float(np.median([difference for _, difference in self.likeness]))
-        return [f for f, difference in self.likeness if difference <= _DOUBLED * usual]
+        """Frames that repeat the one before, while before and after something moves."""
+        differences = [difference for _, difference in self.likeness]
+        repeated = []
+        for number, (frame, difference) in enumerate(self.likeness):
+            around = differences[max(number - 1, 0) : number] + differences[number + 1 : number + 2]
+            if around and min(around) > 0 and difference <= _DOUBLED * min(around):
+                repeated.append(frame)
+        return repeated
 
     def dropped(self, rate: Fraction | None) -> list[Frame]:
         """Frames before which at least one is missing by the clock."""
@@ -165,12 +171,13 @@ def capture(
         },
         {"input": opened.name},
     )
-    mark = recipe.fingerprint([opened.name])
-    provenance = recipe.provenance(mark)
+    mark = recipe.fingerprint([opened.fingerprint, str(run.frames), str(start)])
 
     def place(frame: Frame) -> Path:
         return output / frame_file(name, frame, suffix)
 
+    if run.resume and (kept := _kept(output, mark, place)) is not None:
+        return kept
     if opened.frames is not None:
         refuse_existing(map(place, opened.frames), run)
     elif output.is_dir():
@@ -187,10 +194,13 @@ def capture(
 
     def work(taken: _Taken) -> tuple[_Taken, NDArray[np.floating], float | None, float]:
         linear = _linear(taken, transfer, crop, size)
-        if suffix == EXR:
-            write_exr(place(taken.frame), {"RGB": to_half(linear)}, header, provenance)
+        path, own = place(taken.frame), recipe.fingerprint([taken.fingerprint])
+        if run.resume and current([path], own) is not None:
+            pass
+        elif suffix == EXR:
+            write_exr(path, {"RGB": to_half(linear)}, header, recipe.provenance(own))
         else:
-            write_png(place(taken.frame), to_code(linear), provenance)
+            write_png(path, to_code(linear), recipe.provenance(own))
         gray = camera_motion.prepare(luminance(linear))
         shift = camera_motion.shift(reference[0], gray, size[0])
         top = 1.0 if taken.linear else 0.999
@@ -199,10 +209,12 @@ def capture(
 
     report = _Report()
     frames: list[Frame] = []
+    rows: dict[str, Any] = {}
     total = len(opened.frames) if opened.frames is not None else 0
     run.progress(0, total)
     for taken, linear, shift, clipped in ordered_map(work, prepared(), run.jobs):
         frames.append(taken.frame)
+        rows[str(taken.frame)] = {"fingerprint": recipe.fingerprint([taken.fingerprint])}
         report.add(taken, linear, shift)
         report.clipped.append(clipped)
         run.progress(len(frames), max(total, len(frames)))
@@ -222,7 +234,7 @@ def capture(
             "doubled",
         )
     }
-    write_manifest(output, recipe, mark, figures, {str(f): {} for f in frames})
+    write_manifest(output, recipe, mark, figures, rows)
     _warn(record, strict, output)
     return Result("capture", output, frames, 0, opened.absent, figures)
 
@@ -256,15 +268,17 @@ def _from_movie(path: Path, run: Run, transfer: str, start: int) -> _Source:
     if info.transfer is None and transfer == "auto":
         raise InputError(f"{path}: its transfer function can't be undone here; give --transfer")
     wanted = None if run.frames is None else set(parse_frames(run.frames))
+    mark = fingerprint_movie(path)
 
     def taken() -> Iterator[_Taken]:
         for item in movie.frames():
             frame = start + item.position
             if wanted is None or frame in wanted:
-                yield _Taken(frame, item.seconds, item.coded, linear=False)
+                yield _Taken(frame, item.seconds, item.coded, False, f"{mark} {item.position}")
 
     return _Source(
         name=path.name,
+        fingerprint=mark,
         header=Header(info.width, info.height, frame_rate=info.frame_rate),
         transfer=info.transfer or transfer,
         assumed=list(info.assumed),
@@ -283,16 +297,18 @@ def _from_sequence(footage: Footage, run: Run, start: int | None) -> _Source:
     integer = next(iter(image.layers.values())).dtype
     bits = {"uint8": 8, "uint16": 16}.get(integer.name)
     kind = "PNG" if bits else "EXR"
+    marks = [fingerprint_file(footage.sequence.path(frame)) for frame in frames]
 
     def taken() -> Iterator[_Taken]:
         for frame in frames:
             stored = footage.image(frame)
             values = stored.rgb("none")
             seconds = None if rate is None else float(Fraction(frame - first) / rate)
-            yield _Taken(frame + offset, seconds, values, linear=bits is None)
+            yield _Taken(frame + offset, seconds, values, bits is None, stored.fingerprint)
 
     return _Source(
         name=Path(footage.sequence.pattern).name,
+        fingerprint=" ".join(marks),
         header=footage.header,
         transfer=footage.transfer,
         assumed=[f"{kind} frames are taken as {footage.transfer}"],
@@ -307,6 +323,8 @@ def _from_camera(device: int, seconds: float, start: int) -> _Source:
     frames = camera_frames(device, seconds)
     first = next(frames)
     height, width = first.coded.shape[:2]
+    # A recording is never the same twice.
+    mark = uuid.uuid4().hex
 
     def taken() -> Iterator[_Taken]:
         def all_frames() -> Iterator[MovieFrame]:
@@ -314,10 +332,11 @@ def _from_camera(device: int, seconds: float, start: int) -> _Source:
             yield from frames
 
         for item in all_frames():
-            yield _Taken(start + item.position, item.seconds, item.coded, linear=False)
+            yield _Taken(start + item.position, item.seconds, item.coded, False, mark)
 
     return _Source(
         name=f"camera {device}",
+        fingerprint=mark,
         header=Header(width, height),
         transfer="srgb",
         assumed=["cameras are taken as sRGB-encoded, 8 bit"],
@@ -325,6 +344,25 @@ def _from_camera(device: int, seconds: float, start: int) -> _Source:
         frames=None,
         taken=taken(),
     )
+
+
+def _kept(output: Path, mark: str, place: Callable[[Frame], Path]) -> Result | None:
+    """The result of an earlier run of the same, if all that it wrote is still there and whole."""
+    manifest = read_manifest(output)
+    rows, figures = manifest.get("frames"), manifest.get("figures")
+    if manifest.get("fingerprint") != mark or not isinstance(rows, dict) or figures is None:
+        return None
+    try:
+        frames = parse_frames(",".join(rows))
+    except OptionError:
+        return None
+    whole = (output / RECORD).is_file() and all(
+        current([place(frame)], rows[str(frame)]["fingerprint"]) is not None for frame in frames
+    )
+    if not whole:
+        return None
+    write_json(output / MANIFEST, manifest)
+    return Result("capture", output, frames, len(frames), (), figures)
 
 
 def _size(header: Header, crop: Crop | None, scale: float) -> tuple[int, int]:

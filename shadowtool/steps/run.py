@@ -169,7 +169,7 @@ class FrameWork:
         try:
             inputs = [fingerprint_file(path) for path in self.sources(frame)]
             mark = self.recipe.fingerprint([*self.shared, *inputs])
-            if run.resume and (figures := _current(self.products(frame), mark)) is not None:
+            if run.resume and (figures := current(self.products(frame), mark)) is not None:
                 return {"fingerprint": mark, **figures}, True
             figures = self.make(frame, self.recipe.provenance(mark))
         except (DamagedFileError, InputError):
@@ -196,7 +196,7 @@ def with_figures(provenance: dict[str, str], figures: Figures) -> dict[str, str]
     return {**provenance, "figures": json.dumps(figures, sort_keys=True)}
 
 
-def _current(files: list[Path], mark: str) -> Figures | None:
+def current(files: list[Path], mark: str) -> Figures | None:
     """The figures of products that are whole and made of the same; None if they aren't."""
     figures: Figures = {}
     for file in files:
@@ -217,12 +217,14 @@ def unchanged(output: Path, products: Iterable[Path], mark: str) -> Figures | No
     manifest = read_manifest(output)
     if manifest.get("fingerprint") != mark:
         return None
-    if _current([file for file in products if file.suffix == EXR], mark) is None:
+    if current([file for file in products if file.suffix == EXR], mark) is None:
         return None
-    if not all(file.is_file() for file in products):
+    figures = manifest.get("figures")
+    if not isinstance(figures, dict) or not all(file.is_file() for file in products):
         return None
-    figures = manifest.get("figures", {})
-    return figures if isinstance(figures, dict) else {}
+    # Written anew, so that make sees that the step has been looked after.
+    write_json(output / MANIFEST, manifest)
+    return figures
 
 
 def write_manifest(

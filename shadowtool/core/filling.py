@@ -1,0 +1,91 @@
+"""Giving unknown pixels the values of those around them."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+_CROSS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], np.float32) / 4
+_RELAXATIONS = 24
+# More unknown parts than this are filled all at once.
+_MOST_PARTS = 64
+
+
+def fill_membrane(values: Float32, weight: Float32) -> Float32:
+    """Stretch a membrane over the unknown pixels: there the Laplacian is 0.
+
+    From coarse to fine: each level of a pyramid starts from the one above and is relaxed.
+
+    Args:
+        values: (H, W, C) float32; unknown pixels may hold anything finite.
+        weight: (H, W) float32 ≥ 0; pixels above 0 are known and keep their values. On coarser
+            levels, known pixels that fall together count by their weight.
+
+    Returns:
+        (H, W, C) float32; all 0 if no pixel has any weight.
+    """
+    known = weight > 0
+    if not known.any():
+        return np.zeros_like(values)
+    filled = values.copy()
+    labels, boxes = _parts(~known)
+    for label, (rows, columns) in boxes.items():
+        patch = _fill(values[rows, columns], np.ascontiguousarray(weight[rows, columns]))
+        own = labels[rows, columns] == label
+        filled[rows, columns][own] = patch[own]
+    return filled
+
+
+def _parts(
+    unknown: NDArray[np.bool_],
+) -> tuple[NDArray[np.int32], dict[int, tuple[slice, slice]]]:
+    """The unknown parts' labels and boxes, each with the ring of known pixels that holds it."""
+    height, width = unknown.shape
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(
+        unknown.astype(np.uint8), connectivity=8
+    )
+    if count > _MOST_PARTS:
+        return unknown.astype(np.int32), {1: (slice(0, height), slice(0, width))}
+    found = {}
+    for label, (x, y, w, h, _) in enumerate(boxes.tolist()[1:], start=1):
+        rows = slice(max(y - 2, 0), min(y + h + 2, height))
+        columns = slice(max(x - 2, 0), min(x + w + 2, width))
+        found[label] = (rows, columns)
+    return np.asarray(labels, np.int32), found
+
+
+def _fill(values: Float32, weight: Float32) -> Float32:
+    height, width = weight.shape
+    known = weight > 0
+    if known.all():
+        return values
+    if not known.any():
+        return np.zeros_like(values)
+    if max(height, width) <= 2:
+        mean = (values * weight[..., None]).sum(axis=(0, 1)) / weight.sum()
+        return np.where(known[..., None], values, mean).astype(np.float32)
+    half = ((width + 1) // 2, (height + 1) // 2)
+    # Twice the half may be one more than the whole; a known edge is not stretched by repeating it.
+    padded = ((0, height % 2), (0, width % 2))
+    total = np.pad(weight, padded, mode="edge")
+    weighted = np.pad(values * weight[..., None], (*padded, (0, 0)), mode="edge")
+    small_weight = _halved(total)
+    small = _halved(weighted) / np.maximum(small_weight, np.float32(1e-12))[..., None]
+    small = _fill(small, small_weight)
+    large = np.asarray(
+        cv2.resize(small, (2 * half[0], 2 * half[1]), interpolation=cv2.INTER_LINEAR)
+    )
+    large = large.reshape(2 * half[1], 2 * half[0], -1)[:height, :width]
+    filled = np.where(known[..., None], values, large).astype(np.float32)
+    for _ in range(_RELAXATIONS):
+        around = cv2.filter2D(filled, -1, _CROSS, borderType=cv2.BORDER_REFLECT)
+        filled = np.where(known[..., None], values, around.reshape(values.shape))
+    return filled
+
+
+def _halved(image: Float32) -> Float32:
+    """The mean of each two by two pixels."""
+    return np.asarray(
+        (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2]) / 4, np.float32
+    )

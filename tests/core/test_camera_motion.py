@@ -1,0 +1,40 @@
+import cv2
+import numpy as np
+import pytest
+
+from shadowtool.core.camera_motion import prepare, shift
+
+
+def ground(seed: int = 0, size: tuple[int, int] = (240, 320)) -> np.ndarray:
+    noise = np.random.default_rng(seed).uniform(0.1, 0.9, size).astype(np.float32)
+    return cv2.GaussianBlur(noise, (0, 0), 2.0)
+
+
+def moved(image: np.ndarray, x: float, y: float) -> np.ndarray:
+    matrix = np.float32([[1, 0, x], [0, 1, y]])
+    return cv2.warpAffine(image, matrix, image.shape[::-1], borderMode=cv2.BORDER_REFLECT)
+
+
+@pytest.mark.parametrize("x, y", [(0.0, 0.0), (0.3, 0.0), (-0.7, 1.1), (3.0, -2.0)])
+def test_a_moved_camera_is_measured_below_a_tenth_of_a_pixel(x: float, y: float) -> None:
+    image = ground()
+    found = shift(prepare(image), prepare(moved(image, x, y)), image.shape[1])
+    assert found == pytest.approx(np.hypot(x, y), abs=0.1)
+
+
+def test_large_frames_are_measured_in_their_own_pixels() -> None:
+    image = cv2.resize(ground(), (1600, 1200), interpolation=cv2.INTER_CUBIC)
+    found = shift(prepare(image), prepare(moved(image, 2.0, 0.0)), 1600)
+    assert found == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_shadow_that_moves_is_not_the_camera() -> None:
+    image = ground()
+    shaded = image.copy()
+    shaded[60:200, 100:220] *= 0.2
+    assert shift(prepare(image), prepare(shaded), image.shape[1]) == pytest.approx(0, abs=0.05)
+
+
+def test_a_picture_without_texture_tells_nothing() -> None:
+    blank = np.full((100, 100), 0.5, np.float32)
+    assert shift(prepare(blank), prepare(blank), 100) is None

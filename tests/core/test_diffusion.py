@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from shadowtool.core.diffusion import diffuse
+from shadowtool.core.warp_map import WarpMap, identity_map
+from tests.scene import Scene
+
+SCENE = Scene()
+
+
+def noisy_map(sigma: float = 0.3, error: float = 0.3, seed: int = 0) -> WarpMap:
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(size=SCENE.warp.shape).astype(np.float32) * np.float32(sigma)
+    return WarpMap(SCENE.warp + noise, np.full(SCENE.warp.shape[:2], error, np.float32))
+
+
+def distance(warp: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(warp - SCENE.warp, axis=-1)
+
+
+def test_noise_is_smoothed() -> None:
+    noisy = noisy_map()
+    assert distance(diffuse(noisy).warp).mean() < 0.35 * distance(noisy.warp).mean()
+
+
+def test_the_step_of_an_object_stays_sharp() -> None:
+    smooth = diffuse(noisy_map(0.1))
+    rows, columns = SCENE.rows, SCENE.columns
+    inside = smooth.warp[rows[0] : rows[1], columns[0] : columns[1]]
+    expected = SCENE.warp[rows[0] : rows[1], columns[0] : columns[1]]
+    assert np.linalg.norm(inside - expected, axis=-1).max() < 0.5
+
+
+def test_unknown_pixels_are_filled_and_say_so() -> None:
+    known = noisy_map(0.0)
+    warp, error = known.warp.copy(), known.error.copy()
+    warp[70:80, 20:40] = np.nan
+    error[70:80, 20:40] = np.inf
+    filled = diffuse(WarpMap(warp, error))
+    assert np.isfinite(filled.warp).all()
+    assert distance(filled.warp)[70:80, 20:40].max() < 0.1
+    assert np.isinf(filled.error[70:80, 20:40]).all()
+    assert (filled.confidence[70:80, 20:40] == 0).all()
+
+
+def test_what_is_well_known_is_not_moved_by_what_is_not() -> None:
+    known = noisy_map(0.0, 0.05)
+    warp, error = known.warp.copy(), known.error.copy()
+    warp[:, 120:] += 1.0
+    error[:, 120:] = 50.0
+    smooth = diffuse(WarpMap(warp, error))
+    assert distance(smooth.warp)[:, :118].max() < 0.15
+    assert distance(smooth.warp)[10:80, 121].mean() < 0.7
+
+
+def test_nothing_known_stays_unknown() -> None:
+    nothing = WarpMap(np.full((8, 9, 2), np.nan, np.float32), np.full((8, 9), np.inf, np.float32))
+    assert np.isnan(diffuse(nothing).warp).all()
+
+
+def test_no_iterations_only_fill() -> None:
+    noisy = noisy_map()
+    assert diffuse(noisy, iterations=0).warp == pytest.approx(noisy.warp, abs=1e-4)
+
+
+def test_the_identity_stays_exactly() -> None:
+    identity = WarpMap(identity_map(20, 30), np.zeros((20, 30), np.float32))
+    assert np.array_equal(diffuse(identity).warp, identity.warp)

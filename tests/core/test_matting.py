@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from shadowtool.core.matting import (
+    BACKGROUND,
+    FIGURE,
+    difference_alpha,
+    difference_trimap,
+    line_distance,
+    pull_figure,
+)
+from shadowtool.core.noise import NoiseModel
+from shadowtool.core.plates import Plates
+from tests.scene import Scene
+
+SCENE = Scene()
+PLATES = Plates(SCENE.lit, SCENE.shadow)
+NOISE = NoiseModel(np.full(3, 4.5e-5), np.full(3, 1e-6))
+
+
+def shot(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """A blue figure before a shadow, and its true alpha."""
+    alpha = 1 - SCENE.disk(50, 45, radius=15, soft=2)
+    background = SCENE.image(SCENE.disk(80, 45, radius=20))
+    colour = np.float32([0.05, 0.1, 0.9])
+    image = alpha[..., None] * colour + (1 - alpha[..., None]) * background
+    return SCENE.noisy(image, seed), alpha
+
+
+def test_background_in_any_shadow_lies_on_the_line() -> None:
+    image = SCENE.noisy(SCENE.image(SCENE.disk(80, 45, radius=30, soft=40)), 2)
+    assert np.percentile(line_distance(image, PLATES, NOISE), 99) < 5
+
+
+def test_brighter_than_lit_and_darker_than_shadow_are_off_the_line() -> None:
+    assert (line_distance(SCENE.lit * 1.5, PLATES, NOISE) > 8).all()
+    assert (line_distance(SCENE.shadow * 0.2, PLATES, NOISE) > 8).mean() > 0.99
+
+
+def test_unknown_plates_say_nothing_of_a_figure() -> None:
+    plates = Plates(np.full_like(SCENE.lit, np.nan), SCENE.shadow)
+    assert (line_distance(SCENE.lit, plates, NOISE) == 0).all()
+
+
+def test_the_trimap_is_right_where_it_is_sure() -> None:
+    image, alpha = shot()
+    trimap = difference_trimap(line_distance(image, PLATES, NOISE))
+    assert (alpha[trimap == FIGURE] > 0.99).all()
+    assert (alpha[trimap == BACKGROUND] < 0.01).all()
+    assert (trimap == FIGURE).sum() > 0.5 * alpha.sum()
+
+
+def test_an_empty_scene_has_no_figure() -> None:
+    image = SCENE.noisy(SCENE.image(SCENE.disk(80, 45, radius=20)), 3)
+    distance = line_distance(image, PLATES, NOISE)
+    trimap = difference_trimap(distance)
+    assert (trimap == BACKGROUND).all()
+    assert (difference_alpha(distance, trimap) == 0).all()
+
+
+def test_alpha_keeps_what_the_trimap_is_sure_of() -> None:
+    image, alpha = shot()
+    distance = line_distance(image, PLATES, NOISE)
+    trimap = difference_trimap(distance)
+    found = difference_alpha(distance, trimap)
+    assert (found[trimap == FIGURE] == 1).all() and (found[trimap == BACKGROUND] == 0).all()
+    assert np.abs(found - alpha).mean() < 0.02
+
+
+def test_the_figure_over_its_own_background_is_the_picture() -> None:
+    image, alpha = shot()
+    background = SCENE.image(SCENE.disk(80, 45, radius=20))
+    figure = pull_figure(image, alpha, background)
+    again = figure.foreground + (1 - alpha[..., None]) * background
+    solid = alpha > 0
+    assert again[solid] == pytest.approx(np.maximum(image, 0)[solid], abs=0.02)
+    assert (figure.foreground[alpha == 0] == 0).all()
+    assert (figure.foreground >= 0).all()

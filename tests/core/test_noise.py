@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+
+from shadowtool.core.noise import (
+    NoiseModel,
+    NoiseSamples,
+    extreme_range,
+    noise_levels,
+    noise_model,
+    sample_positions,
+    thin,
+)
+
+SLOPE, FLOOR = 4.5e-5, 1e-6
+
+
+def take(frames: int, seed: int = 0, moving: bool = False) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    clean = rng.uniform(0.02, 0.9, (120, 160, 3))
+    shots = []
+    for number in range(frames):
+        image = clean.copy()
+        if moving:
+            image[:, 5 * number : 5 * number + 30] *= 0.2
+        shots.append(image + rng.normal(size=image.shape) * np.sqrt(SLOPE * image + FLOOR))
+    return shots
+
+
+def model_of(shots: list[np.ndarray]) -> NoiseModel:
+    positions = sample_positions(len(shots))
+    return noise_model(noise_levels({n: thin(shots[p]) for n, p in positions.items()}))
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_photon_and_read_noise_are_found_from_the_take(moving: bool) -> None:
+    model = model_of(take(24, moving=moving))
+    for value in (0.05, 0.18, 0.6):
+        true = np.sqrt(SLOPE * value + FLOOR)
+        assert model.sigma(np.full(3, value)) == pytest.approx([true] * 3, rel=0.15)
+
+
+def test_noise_that_a_codec_freezes_is_found_between_distant_frames() -> None:
+    shots = take(24)
+    frozen = [shots[4 * (number // 4)] for number in range(24)]
+    true = np.sqrt(SLOPE * 0.18 + FLOOR)
+    assert model_of(frozen).sigma(np.full(3, 0.18)) == pytest.approx([true] * 3, rel=0.2)
+
+
+def test_clean_or_single_frames_have_the_least_noise() -> None:
+    still = take(1)
+    for shots in (still, still * 5):
+        assert model_of(shots).sigma(np.full(3, 0.5)) == pytest.approx([2e-4] * 3)
+
+
+def test_frames_with_nothing_finite_are_passed_over() -> None:
+    shots = [np.full((40, 40, 3), np.nan)] * 4
+    assert np.isfinite(model_of(shots).sigma(np.ones(3))).all()
+
+
+@pytest.mark.parametrize("frames", [0, 1, 2, 3, 9, 1000])
+def test_sample_positions_are_pairs_inside_the_take(frames: int) -> None:
+    positions = sample_positions(frames)
+    assert all(0 <= p < frames for p in positions.values())
+    assert all(positions[n + 1] == p + 1 for n, p in positions.items() if n % 2 == 0)
+    assert bool(positions) == (frames >= 2)
+
+
+@pytest.mark.parametrize("frames", [2, 5, 100, 777])
+def test_samples_of_a_take_of_unknown_length_stay_few_and_spread(frames: int) -> None:
+    kept = NoiseSamples()
+    for number in range(frames):
+        kept.add(np.full((2, 2, 3), number, np.float32))
+    samples = kept.samples()
+    numbers = [int(image[0, 0]) for _, image in sorted(samples.items())]
+    assert 2 <= len(numbers) <= 36
+    assert all(b == a + 1 for a, b in zip(numbers[::2], numbers[1::2], strict=False))
+    assert numbers[-1] >= frames * 0.7 - 2
+
+
+def test_pure_noise_stays_within_the_range_of_extremes() -> None:
+    rng = np.random.default_rng(0)
+    for count in (10, 100, 400):
+        ranges = np.ptp(rng.normal(size=(count, 4000)), axis=0)
+        assert (ranges < extreme_range(count)).mean() > 0.995

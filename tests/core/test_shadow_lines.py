@@ -1,0 +1,149 @@
+import numpy as np
+import pytest
+
+from shadowtool.core.shadow_lines import (
+    NoLinesError,
+    ShadowLines,
+    fit_shadow_lines,
+    interpolate_lines,
+    zero_crossings,
+)
+from tests.scene import Scene, Sweep
+
+SCENE = Scene()
+
+
+def edge_times(sweep: Sweep) -> np.ndarray:
+    """When the edge of a sweep that may turn reaches each pixel, by bisection."""
+    low = np.zeros((SCENE.height, SCENE.width))
+    high = np.full(low.shape, float(SCENE.frames_of(sweep)))
+    for _ in range(40):
+        middle = (low + high) / 2
+        angle = sweep.angle + sweep.turn * middle
+        centre = np.array([SCENE.width / 2, SCENE.height / 2])
+        normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        reach = (abs(normal) * centre).sum(axis=-1) + sweep.soft
+        distance = (normal * (SCENE.warp - centre)).sum(axis=-1) + reach - sweep.speed * middle
+        low, high = np.where(distance > 0, middle, low), np.where(distance > 0, high, middle)
+    return low.astype(np.float32)
+
+
+def fitted(sweep: Sweep, time: np.ndarray | None = None) -> ShadowLines:
+    frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
+    return fit_shadow_lines(edge_times(sweep) if time is None else time, SCENE.plane, frames)
+
+
+def errors(lines: ShadowLines, sweep: Sweep) -> np.ndarray:
+    """The largest distance within the picture between each line and the true one."""
+    worst = []
+    for frame, normal, offset in zip(lines.frame, lines.normal, lines.offset, strict=True):
+        true_normal, true_offset = SCENE.edge(sweep, frame)
+        along = np.array([-true_normal[1], true_normal[0]])
+        middle = np.array([SCENE.width / 2, SCENE.height / 2])
+        foot = middle - (true_normal @ middle + true_offset) * true_normal
+        ends = foot + np.array([[-1.0], [1.0]]) * along * 60
+        worst.append(np.abs(ends @ normal + offset).max())
+    return np.array(worst)
+
+
+@pytest.mark.parametrize("angle", np.linspace(0.05, 6.2, 9))
+def test_lines_of_any_direction_are_found(angle: float) -> None:
+    sweep = Sweep(angle)
+    lines = fitted(sweep)
+    assert np.percentile(errors(lines, sweep), 90) < 0.05
+    assert np.hypot(*lines.normal.T) == pytest.approx(1)
+    assert (np.diff(lines.frame) == 1).all()
+    assert (np.abs(np.diff(lines.angle)) < 0.1).all()
+
+
+def test_a_turning_stick_is_followed() -> None:
+    sweep = Sweep(1.0, turn=0.004)
+    lines = fitted(sweep)
+    assert np.percentile(errors(lines, sweep), 90) < 0.1
+
+
+def test_crossings_lie_where_time_equals_the_frame() -> None:
+    ramp = np.tile(np.arange(20, dtype=np.float32) / 2 + 0.3, (5, 1))
+    points = zero_crossings(ramp, np.ones(ramp.shape, bool), np.arange(11.0))
+    for frame, found in points.items():
+        assert found[:, 0] == pytest.approx((frame - 0.3) * 2, abs=1e-4)
+    assert sorted(points) == list(range(1, 10))
+
+
+def test_each_crossing_is_counted_once_where_times_are_whole() -> None:
+    ramp = np.tile(np.arange(8, dtype=np.float32), (3, 1))
+    points = zero_crossings(ramp, np.ones(ramp.shape, bool), np.arange(8.0))
+    assert all(len(found) == 3 for found in points.values())
+
+
+def test_frames_need_not_be_one_apart() -> None:
+    sweep = Sweep(0.4)
+    whole = fitted(sweep)
+    count = SCENE.frames_of(sweep)
+    frames = np.arange(count, dtype=np.float64)
+    time = (edge_times(sweep) * 2 + 1001).astype(np.float32)
+    doubled = fit_shadow_lines(time, SCENE.plane, frames * 2 + 1001)
+    assert doubled.offset == pytest.approx(whole.offset, abs=1e-2)
+
+
+def test_pixels_outside_the_plane_do_not_count() -> None:
+    sweep = Sweep(0.7)
+    time = edge_times(sweep)
+    spoilt = np.where(SCENE.plane, time, np.float32(3.0))
+    assert np.array_equal(fitted(sweep, spoilt).offset, fitted(sweep, time).offset)
+
+
+def test_bad_samples_are_rejected_by_the_neighbouring_lines() -> None:
+    sweep = Sweep(0.3)
+    time = edge_times(sweep)
+    # A patch of the plane in which the times are nonsense for two frames' worth of the sweep.
+    patch = (slice(5, 25), slice(110, 150))
+    spoilt = time.copy()
+    spoilt[patch] = np.where(np.abs(time[patch] - 40) < 3, time[patch] - 9, time[patch])
+    lines = fitted(sweep, spoilt)
+    assert set(lines.origin) >= {"refit"} or "interpolated" in lines.origin
+    assert np.percentile(errors(lines, sweep), 97) < 0.5
+
+
+def test_a_line_whose_direction_jumps_is_replaced_by_its_neighbours() -> None:
+    sweep = Sweep(0.0)
+    time = edge_times(sweep)
+    frame = 30
+    near = np.abs(time - frame) < 0.5
+    rows = np.arange(SCENE.height)[:, None] - SCENE.height / 2
+    tilted = time + np.where(near, 0.012 * rows, 0).astype(np.float32)
+    lines = fitted(sweep, tilted)
+    at = int(np.nonzero(lines.frame == frame)[0][0])
+    assert lines.origin[at] == "interpolated"
+    assert errors(lines, sweep)[at] < 0.3
+
+
+def test_interpolated_lines_lie_between_and_keep_their_length() -> None:
+    sweep = Sweep(1.0, turn=0.004)
+    lines = fitted(sweep)
+    between = interpolate_lines(lines, np.array([lines.frame[5] + 0.5]))
+    assert errors(between, sweep)[0] < 0.1
+    assert np.hypot(*between.normal.T) == pytest.approx(1)
+
+
+def test_times_outside_the_sweep_have_no_line() -> None:
+    lines = fitted(Sweep(1.0))
+    outside = interpolate_lines(lines, np.array([lines.frame[0] - 1, lines.frame[-1] + 1, np.nan]))
+    assert np.isnan(outside.offset).all()
+
+
+def test_a_plane_that_no_edge_crosses_is_refused() -> None:
+    nothing = np.full((SCENE.height, SCENE.width), np.nan, np.float32)
+    with pytest.raises(NoLinesError):
+        fit_shadow_lines(nothing, SCENE.plane, np.arange(30.0))
+    tiny = np.zeros_like(SCENE.plane)
+    tiny[10:12, 10:12] = True
+    with pytest.raises(NoLinesError):
+        fit_shadow_lines(edge_times(Sweep(0.3)), tiny, np.arange(60.0))
+
+
+def test_inputs_are_left_alone() -> None:
+    time = edge_times(Sweep(0.3))
+    before = time.copy()
+    fitted(Sweep(0.3), time)
+    assert np.array_equal(time, before)

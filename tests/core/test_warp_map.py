@@ -1,0 +1,129 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shadowtool.core.shadow_lines import fit_shadow_lines
+from shadowtool.core.shadow_time import ShadowTimes
+from shadowtool.core.warp_map import (
+    Pass,
+    error_of_confidence,
+    from_st_map,
+    identity_map,
+    intersect,
+    line_speed,
+    pass_angles,
+    resample,
+    to_st_map,
+)
+from tests.core.test_shadow_lines import SCENE, edge_times
+from tests.scene import Sweep
+
+ANGLES = (0.2, 1.3, 2.4)
+
+
+def passes(angles: tuple[float, ...] = ANGLES) -> list[Pass]:
+    result = []
+    for angle in angles:
+        sweep = Sweep(angle)
+        time = edge_times(sweep)
+        frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
+        lines = fit_shadow_lines(time, SCENE.plane, frames)
+        result.append(Pass(ShadowTimes(time, np.ones_like(time)), lines))
+    return result
+
+
+@pytest.mark.parametrize("angles", [(0.2, 1.7), ANGLES, (0.1, 0.9, 1.7, 2.5, 4.0)])
+def test_w_is_the_identity_on_the_plane_and_the_displacement_on_the_block(
+    angles: tuple[float, ...],
+) -> None:
+    solved = intersect(passes(angles))
+    known = np.isfinite(solved.error)
+    assert known.mean() > 0.85
+    error = np.linalg.norm(solved.warp - SCENE.warp, axis=-1)
+    assert np.percentile(error[known & SCENE.plane], 99) < 0.1
+    assert np.percentile(error[known & ~SCENE.plane], 99) < 0.1
+
+
+def test_two_passes_are_needed() -> None:
+    one, two, three = passes()
+    one.times.time[:, :80] = np.nan
+    two.times.time[:, :80] = np.nan
+    three.times.time[:30] = np.nan
+    solved = intersect([one, two, three])
+    assert np.isinf(solved.error[:, :80]).all()
+    assert np.isnan(solved.warp[:, :80]).all()
+    assert np.isfinite(solved.error[:30, 85:]).mean() > 0.5
+
+
+def test_near_parallel_passes_fix_nothing() -> None:
+    assert np.isinf(intersect(passes((0.2, 0.25))).error).all()
+
+
+def test_a_pass_of_low_contrast_counts_less() -> None:
+    one, two, three = passes()
+    late = Pass(
+        ShadowTimes(three.times.time + 1, np.full_like(three.times.time, 0.01)), three.lines
+    )
+    solved = intersect([one, two, late])
+    known = np.isfinite(solved.error)
+    assert np.percentile(np.linalg.norm(solved.warp - SCENE.warp, axis=-1)[known], 95) < 0.1
+
+
+def test_angles_and_speed_are_those_of_the_sweeps() -> None:
+    angles = {(i, j): angle for i, j, angle in pass_angles(passes((0.2, 1.3, 3.2)))}
+    assert angles == pytest.approx(
+        {(0, 1): 1.1, (0, 2): np.pi - 3.0, (1, 2): np.pi - 1.9}, abs=0.01
+    )
+    for scan in passes():
+        assert np.median(line_speed(scan.lines, (90, 160))) == pytest.approx(3.3, abs=0.02)
+
+
+def test_confidence_and_error_are_inverse() -> None:
+    error = np.float32([0, 0.5, 3, np.inf])
+    confidence = 1 / (1 + error)
+    assert error_of_confidence(confidence) == pytest.approx(error)
+
+
+def test_the_st_map_of_the_identity() -> None:
+    st_map = to_st_map(identity_map(3, 4), 4, 3)
+    assert st_map[0, 0] == pytest.approx([0.125, 1 - 0.5 / 3])
+    assert st_map[2, 3] == pytest.approx([0.875, 0.5 / 3])
+
+
+@given(st.integers(1, 5000), st.integers(1, 5000), st.floats(-100, 5000), st.floats(-100, 5000))
+def test_st_maps_and_pixels_are_inverse(width: int, height: int, x: float, y: float) -> None:
+    warp = np.float32([[[x, y]]])
+    again = from_st_map(to_st_map(warp, width, height), width, height)
+    # float32 has 24 bits for a position of up to this size.
+    limit = 2.0**-22 * (abs(x) + abs(y) + width + height)
+    assert again == pytest.approx(warp, abs=limit)
+
+
+def test_the_identity_resamples_to_the_same_picture() -> None:
+    image = np.random.default_rng(0).uniform(size=(9, 13)).astype(np.float32)
+    assert resample(image, identity_map(9, 13), 1.0) == pytest.approx(image, abs=1e-6)
+
+
+def test_resampling_is_bilinear() -> None:
+    ramp = np.tile(np.arange(10, dtype=np.float32), (10, 1))
+    warp = identity_map(10, 10)[:, :8] + np.float32([0.37, 0.0])
+    assert resample(ramp, warp, 0.0) == pytest.approx(warp[..., 0], abs=1e-5)
+
+
+def test_outside_the_frame_and_where_the_map_is_unknown_is_lit() -> None:
+    image = np.zeros((5, 5), np.float32)
+    warp = identity_map(5, 5)
+    warp[0, 0] = np.nan
+    warp[0, 1] = (99, 2)
+    warp[0, 2] = (np.inf, 2)
+    warp[0, 3] = (2, -1e9)
+    assert resample(image, warp, 1.0)[0].tolist() == [1, 1, 1, 1, 0]
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_resampling_keeps_channels_and_edge(channels: int) -> None:
+    image = np.zeros((5, 5, channels), np.float32)
+    result = resample(image, identity_map(5, 5) + 50, 1.0)
+    assert result.shape == (5, 5, channels)
+    assert (result == 1).all()

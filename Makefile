@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 .DEFAULT_GOAL := sample
-.PHONY: sample test format clean
+.PHONY: sample test format readme clean
 
 sample: .venv/installed
 	$(MAKE) -C sample_data PATH="$(abspath $(BIN)):$$PATH"
@@ -19,6 +19,10 @@ test: .venv/installed-dev
 format: .venv/installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# The README's reference of the commands, from their own --help.
+readme: .venv/installed-dev
+	$(BIN)/python -m tests.cli.reference
 
 clean:
 	$(MAKE) -C sample_data clean

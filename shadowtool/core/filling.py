@@ -69,14 +69,13 @@ def _fill(values: Float32, weight: Float32) -> Float32:
     # Twice the half may be one more than the whole; a known edge is not stretched by repeating it.
     padded = ((0, height % 2), (0, width % 2))
     total = np.pad(weight, padded, mode="edge")
-    weighted = np.pad(values * weight[..., None], (*padded, (0, 0)), mode="edge")
+    weighted = np.pad(values * weight[..., None], (*padded, (0, 0)), mode="edge").astype(np.float32)
     small_weight = _halved(total)
-    small = _halved(weighted) / np.maximum(small_weight, np.float32(1e-12))[..., None]
-    small = _fill(small, small_weight)
-    large = np.asarray(
-        cv2.resize(small, (2 * half[0], 2 * half[1]), interpolation=cv2.INTER_LINEAR)
-    )
-    large = large.reshape(2 * half[1], 2 * half[0], -1)[:height, :width]
+    divisor = np.maximum(small_weight, np.float32(1e-12))[..., None]
+    small = np.asarray(_halved(weighted) / divisor, np.float32)
+    double = (2 * half[0], 2 * half[1])
+    stretched = cv2.resize(_fill(small, small_weight), double, interpolation=cv2.INTER_LINEAR)
+    large = stretched.reshape(double[1], double[0], -1)[:height, :width]
     filled = np.where(known[..., None], values, large).astype(np.float32)
     for _ in range(_RELAXATIONS):
         around = cv2.filter2D(filled, -1, _CROSS, borderType=cv2.BORDER_REFLECT)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -33,6 +33,8 @@ EXR, PNG = ".exr", ".png"
 _MOST_PIXELS = 1 << 28
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _ATTRIBUTE = "shadowtool."
+# What OpenEXR raises for headers that make no sense; ZeroDivisionError is a rational number's.
+_EXR_FAULTS = (RuntimeError, ValueError, TypeError, ArithmeticError)
 
 
 @dataclass(frozen=True)
@@ -188,15 +190,14 @@ def read_header(path: Path) -> Header:
             large, no EXR or PNG.
         DamagedFileError: not even the header can be read.
     """
-    if path.suffix.lower() == PNG:
-        try:
-            with path.open("rb") as file:
+    try:
+        with path.open("rb") as file:
+            if path.suffix.lower() == PNG:
                 return _png_header(path, file.read(4096))
-        except OSError:
-            return _png_header(path, read_bytes(path))
-    if not path.is_file():
-        read_bytes(path)
-    return _exr_header(path, _open_exr(path, str(path), header_only=True))
+            return _exr_header(path, _open_exr(path, file, header_only=True))
+    except OSError:
+        # The same again for its message.
+        return read_image(path).header
 
 
 def read_image(path: Path) -> Image:
@@ -249,7 +250,7 @@ def write_exr(
         if header.time_code is not None:
             attributes["timeCode"] = header.time_code
     for key, value in (provenance or {}).items():
-        attributes[_ATTRIBUTE + key] = value
+        attributes[_ATTRIBUTE + key] = value.encode("utf-8", "replace").decode()
     buffer = io.BytesIO()
     try:
         OpenEXR.File(attributes, arrays).write(buffer)
@@ -295,10 +296,12 @@ def to_code(linear: NDArray[np.floating], transfer: str = "srgb") -> NDArray[np.
     return np.rint(np.clip(np.nan_to_num(coded), 0, 1) * 65535).astype(np.uint16)
 
 
-def _open_exr(path: Path, source: str | io.BytesIO, header_only: bool = False) -> Any:
+def _open_exr(
+    path: Path, source: BinaryIO, header_only: bool = False, separate: bool = False
+) -> Any:
     try:
-        return OpenEXR.File(source, separate_channels=False, header_only=header_only)
-    except (RuntimeError, ValueError, UnicodeDecodeError, TypeError) as error:
+        return OpenEXR.File(source, separate_channels=separate, header_only=header_only)
+    except _EXR_FAULTS as error:
         raise DamagedFileError(
             f"{path}: no EXR, or its header is damaged; write the frame again"
         ) from error
@@ -309,11 +312,13 @@ def _exr_header(path: Path, file: Any) -> Header:
         if not file.parts:
             raise DamagedFileError(f"{path}: the EXR holds no picture; write the frame again")
         raw = file.header(0)
-    except (RuntimeError, UnicodeDecodeError) as error:
-        raise DamagedFileError(f"{path}: the EXR header is damaged") from error
+        names = {channel.name for channel in raw.get("channels", [])}
+    except _EXR_FAULTS as error:
+        raise DamagedFileError(
+            f"{path}: the EXR header is damaged; write the frame again"
+        ) from error
     if raw.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
         raise InputError(f"{path}: a deep EXR; flatten it first")
-    names = {channel.name for channel in raw.get("channels", [])}
     if {"RY", "BY"} & names:
         raise InputError(f"{path}: a luminance/chroma EXR; convert it to R, G, B first")
     first, last = _window(path, raw, "displayWindow")
@@ -351,7 +356,11 @@ def _decode_exr(path: Path, data: bytes) -> Image:
     # multi-part file vanishes without a word when the pixels are read.
     listed = _open_exr(path, io.BytesIO(data), header_only=True)
     header = _exr_header(path, listed)
-    file = _open_exr(path, io.BytesIO(data))
+    try:
+        file = _open_exr(path, io.BytesIO(data))
+    except DamagedFileError:
+        # OpenEXR joins R, G, B to one array only where they are of one type.
+        file = _open_exr(path, io.BytesIO(data), separate=True)
     if len(file.parts) != len(listed.parts):
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
     if len(file.parts) > 1:
@@ -366,6 +375,10 @@ def _decode_exr(path: Path, data: bytes) -> Image:
         layers[name] = _placed(values, first, header)
     if not layers:
         raise InputError(f"{path}: has no channels")
+    if {"R", "G", "B"} <= layers.keys():
+        names = [name for name in "RGBA" if name in layers]
+        colour = np.stack([layers.pop(name).astype(np.float32) for name in names], axis=-1)
+        layers["".join(names)] = colour
     return Image(path, header, layers, fingerprint(data))
 
 

@@ -195,10 +195,10 @@ def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
     return WarpMap(from_st_map(st_map, width, height), error), image.header, image.fingerprint
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """A step's record; empty if there is none, or none that can be read."""
+def read_record(path: Path) -> dict[str, Any]:
+    """A JSON record of ours; empty if there is none, or none that can be read."""
     try:
-        record = json.loads((folder / MANIFEST).read_bytes())
+        record = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError):
         return {}
     return record if isinstance(record, dict) else {}

@@ -7,8 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from typing import NamedTuple
 
-from fileseq import findSequenceOnDisk, findSequencesOnDisk
+from fileseq import findSequencesInList
 from fileseq.exceptions import FileSeqException
 from fileseq.filesequence import FileSequence
 from fileseq.frameset import FrameSet
@@ -19,6 +20,8 @@ from shadowtool.io.image import EXR, PNG
 
 Frame = int | Decimal
 
+# Frame numbers further apart than this are not one sequence.
+_WIDEST = 1_000_000
 _TOKENS = re.compile(r"[#@]|%\d*d|\$F\d*|<UDIM>")
 
 
@@ -153,67 +156,103 @@ def frame_range(frames: Iterable[Frame]) -> str:
 
 
 def frame_file(name: str, frame: Frame, suffix: str) -> str:
-    """``NAME.1001.exr``: four digits at least, a fraction kept."""
+    """``NAME.1001.exr``: four characters at least, a fraction kept."""
     whole, dot, part = str(frame).partition(".")
-    sign, digits = ("-", whole[1:]) if whole.startswith("-") else ("", whole)
-    return f"{name}.{sign}{digits.zfill(4)}{dot}{part}{suffix}"
+    return f"{name}.{whole.zfill(4)}{dot}{part}{suffix}"
 
 
 def _in_folder(folder: Path, role: str) -> Sequence:
     found = _sequences(folder)
     if not found:
         raise InputError(f"{folder}: holds no EXR or PNG frames for the {role}")
-    if len(found) > 1:
-        names = " and ".join(sequence.pattern for sequence in found[:2])
-        more = f" and {len(found) - 2} more" if len(found) > 2 else ""
-        raise InputError(f"{folder}: holds {names}{more}; name the one that is meant")
-    return found[0]
-
-
-def _sequences(folder: Path) -> list[Sequence]:
-    found = findSequencesOnDisk(os.fspath(folder))
-    images = [s for s in found if s.extension().lower() in (EXR, PNG)]
-    if len(images) > 1 and all(s.frameSet() for s in images):
-        # 1001.00, 1001.50, 1002.00 look like a sequence for each whole number.
-        fractional = findSequencesOnDisk(os.fspath(folder), allow_subframes=True)
-        fractional = [s for s in fractional if s.extension().lower() in (EXR, PNG)]
-        if len(fractional) == 1:
-            images = fractional
-    numbered = [s for s in images if s.frameSet()]
     # One sequence and a still beside it (a reference, a slate) is one sequence.
-    chosen = numbered or images
-    return [_from_fileseq(s) for s in sorted(chosen, key=str)]
+    chosen = [sequence for sequence in found if sequence.numbered] or found
+    if len(chosen) > 1:
+        names = " and ".join(item.sequence.pattern for item in chosen[:2])
+        more = f" and {len(chosen) - 2} more" if len(chosen) > 2 else ""
+        raise InputError(f"{folder}: holds {names}{more}; name the one that is meant")
+    return chosen[0].sequence
 
 
-def _from_fileseq(sequence: FileSequence) -> Sequence:
-    folder = Path(sequence.dirname())
+class _Found(NamedTuple):
+    """A sequence in a folder, and what its files' names are made of."""
+
+    sequence: Sequence
+    base: str
+    suffix: str
+    numbered: bool
+
+
+def _sequences(folder: Path) -> list[_Found]:
+    names = sorted(
+        entry.name
+        for entry in os.scandir(folder)
+        if not entry.name.startswith(".") and Path(entry.name).suffix.lower() in (EXR, PNG)
+    )
+    try:
+        found = findSequencesInList(names)
+        if len(found) > 1 and all(s.frameSet() for s in found):
+            # 1001.00, 1001.50, 1002.00 look like a sequence for each whole number.
+            fractional = findSequencesInList(names, allow_subframes=True)
+            if len(fractional) == 1 and _fractions(_frames(fractional[0].frameSet() or ())):
+                found = fractional
+        return [_from_fileseq(folder, s) for s in sorted(found, key=str)]
+    except FileSeqException as error:
+        raise InputError(f"{folder}: its frames can't be numbered: {error}") from None
+
+
+def _fractions(frames: list[Frame]) -> bool:
+    """Whether the digits after the point are parts of a frame, not takes' own frame numbers."""
+    parts = {frame % 1 for frame in frames}
+    return len(parts) <= len({frame // 1 for frame in frames})
+
+
+def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
     frame_set = sequence.frameSet()
+    base, suffix = sequence.basename(), sequence.extension()
     if not frame_set:
-        return _single(Path(str(sequence)))
-    files = {frame: Path(sequence.frame(frame)) for frame in sorted(_frames(frame_set))}
+        path = folder / str(sequence)
+        return _Found(_single(path), base, suffix, numbered=False)
+    frames = sorted(_frames(frame_set))
+    if frames[-1] - frames[0] > _WIDEST:
+        raise InputError(
+            f"{folder / base}*{suffix}: numbers from {frames[0]} to {frames[-1]} are no sequence;"
+            " put the stray frame elsewhere"
+        )
+    files = {frame: folder / sequence.frame(frame) for frame in frames}
     padding = "#" * max(sequence.zfill(), 1)
-    name = sequence.basename().rstrip("._- ")
-    pattern = folder / f"{sequence.basename()}{padding}{sequence.extension()}"
-    return Sequence(name or folder.name, os.fspath(pattern), files)
+    name = base.rstrip("._- ") or folder.resolve().name
+    pattern = os.fspath(folder / f"{base}{padding}{suffix}")
+    return _Found(Sequence(name, pattern, files), base, suffix, numbered=True)
 
 
 def _single(path: Path) -> Sequence:
     if path.suffix.lower() not in (EXR, PNG):
         raise InputError(f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on it first")
-    number = re.search(r"[._](\d+)$", path.stem)
-    return Sequence(path.stem, os.fspath(path), {int(number[1]) if number else 1: path})
+    number = re.fullmatch(r"(?:(.*?)[._-]?)?(\d+)", path.stem)
+    if number is None:
+        return Sequence(path.stem, os.fspath(path), {1: path})
+    name = number[1] or path.resolve().parent.name
+    return Sequence(name, os.fspath(path), {int(number[2]): path})
 
 
 def _of_pattern(path: Path, role: str) -> Sequence:
-    try:
-        wanted = FileSequence(os.fspath(path))
-        found = findSequenceOnDisk(os.fspath(path))
-    except (FileSeqException, ValueError, OSError):
-        raise InputError(f"{_short(os.fspath(path))}: no frames for the {role} are there") from None
-    if found.extension().lower() not in (EXR, PNG):
+    suffix = path.suffix
+    if suffix.lower() not in (EXR, PNG):
         raise InputError(f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on it first")
-    sequence = _from_fileseq(found)
-    asked = _frames(wanted.frameSet() or ())
+    try:
+        wanted = FileSequence(path.name)
+        base, asked = wanted.basename(), _frames(wanted.frameSet() or ())
+        found = [
+            item.sequence
+            for item in _sequences(path.parent)
+            if item.numbered and (item.base, item.suffix) == (base, suffix)
+        ]
+    except (FileSeqException, ValueError, OSError):
+        found = []
+    if not found:
+        raise InputError(f"{_short(os.fspath(path))}: no frames for the {role} are there")
+    sequence = found[0]
     if not asked:
         return sequence
     absent = [frame for frame in asked if frame not in sequence.files]

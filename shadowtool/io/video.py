@@ -36,6 +36,7 @@ class MovieInfo:
         pixel_format: FFmpeg's name.
         bits: of each stored sample.
         transfer: the transfer function's name; None if it is one that we can't undo.
+        frames: how many there are, if the container says so.
         assumed: sentences about what the file left open.
     """
 
@@ -45,6 +46,7 @@ class MovieInfo:
     pixel_format: str
     bits: int
     transfer: str | None
+    frames: int | None
     assumed: tuple[str, ...]
 
 
@@ -137,13 +139,17 @@ class Movie:
             self._weights = _MATRICES[matrix]
         if not self._rgb and int(context.color_range) == 0 and not self._full:
             assumed.append("the movie names no range: video range (16-235) is assumed")
+        bits = max(component.bits for component in pixel_format.components)
+        # FFmpeg widens samples to 16 bits by a shift, so that full white is not all ones.
+        self._white = np.float32(((1 << bits) - 1) << (16 - bits)) if bits <= 16 else 65535
         rate = self._stream.average_rate or self._stream.guessed_rate
         return MovieInfo(
             width=context.width,
             height=context.height,
             frame_rate=Fraction(rate) if rate else None,
             pixel_format=pixel_format.name,
-            bits=max(component.bits for component in pixel_format.components),
+            bits=bits,
+            frames=self._stream.frames or None,
             transfer=transfer,
             assumed=tuple(assumed),
         )
@@ -153,7 +159,7 @@ class Movie:
         # planes here and brings chroma to full size, and the matrix is applied below.
         if self._rgb:
             packed = frame.reformat(format="gbrp16le").to_ndarray()
-            return packed.astype(np.float32) / np.float32(65535)
+            return packed.astype(np.float32) / self._white
         if self._gray:
             gray = frame.reformat(format="gray16le").to_ndarray().astype(np.float32)
             return np.repeat(self._luma(gray)[..., None], 3, axis=-1)
@@ -169,11 +175,11 @@ class Movie:
 
     def _luma(self, code: Float32) -> Float32:
         if self._full:
-            return code / np.float32(65535)
+            return code / self._white
         return (code - np.float32(16 * 256)) / np.float32(219 * 256)
 
     def _chroma(self, code: Float32) -> Float32:
-        scale = np.float32(65535) if self._full else np.float32(224 * 256)
+        scale = self._white if self._full else np.float32(224 * 256)
         return (code - np.float32(128 * 256)) / scale
 
 

@@ -1,12 +1,11 @@
 """Footage from a movie, a sequence or a camera to numbered linear frames, and what it is worth."""
 
 import logging
-import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -17,36 +16,36 @@ from shadowtool.core import camera_motion
 from shadowtool.core.noise import NoiseSamples, noise_levels
 from shadowtool.core.shadow_time import luminance
 from shadowtool.core.transfer import TRANSFERS
-from shadowtool.errors import InputError, OptionError, ReshootError
-from shadowtool.io.files import fingerprint_file, fingerprint_movie, make_folder
-from shadowtool.io.image import (
-    EXR,
-    PNG,
-    Header,
-    read_image,
-    to_code,
-    to_half,
-    write_exr,
-    write_png,
-)
-from shadowtool.io.products import MANIFEST, read_manifest, write_json
-from shadowtool.io.sequence import Frame, frame_file, frame_range, parse_frames
-from shadowtool.io.video import Movie, MovieFrame, camera_frames, is_movie
+from shadowtool.errors import DamagedFileError, InputError, OptionError, ReshootError
+from shadowtool.io.files import make_folder
+from shadowtool.io.image import EXR, PNG, Header, to_code, to_half, write_exr, write_png
+from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
+from shadowtool.io.sequence import Frame, frame_file, frame_range
 from shadowtool.parallel import ordered_map
-from shadowtool.steps.footage import Footage, open_footage
-from shadowtool.steps.run import Recipe, Result, Run, current, refuse_existing, write_manifest
+from shadowtool.steps.intake import Arriving, Source, open_source
+from shadowtool.steps.run import (
+    Figures,
+    Recipe,
+    Result,
+    Run,
+    current,
+    refuse_existing,
+    write_manifest,
+)
 
 logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 
 RECORD = "capture.json"
-FIRST_FRAME = 1001
 # A camera counts as moved from here on, pixels.
 _MOVED = 0.25
 # Neighbouring frames this much more alike than those around are the same picture twice.
 _DOUBLED = 0.05
 _GRID = 8
+# Integer code values from here on are clipped; floating point has no top but 1 is where most
+# cameras' files end.
+_CLIPPED_CODE = 0.999
 # The part of the record that is shown when the step is done.
 _FIGURES = ("transfer", "bits", "frame_rate", "camera_motion", "clipped", "dropped", "doubled")
 
@@ -60,70 +59,8 @@ class Crop:
     x: int
     y: int
 
-
-@dataclass(frozen=True)
-class _Taken:
-    """A frame on its way in."""
-
-    frame: Frame
-    seconds: float | None
-    values: NDArray[np.floating]
-    linear: bool
-    fingerprint: str
-
-
-@dataclass
-class _Source:
-    """Where frames come from, and what is known of it beforehand."""
-
-    name: str
-    fingerprint: str
-    header: Header
-    transfer: str
-    assumed: list[str]
-    bits: int | None
-    frames: list[Frame] | None
-    taken: Iterator[_Taken]
-    absent: list[Frame] = field(default_factory=list)
-
-
-@dataclass
-class _Report:
-    """Collects, frame by frame in order, what `capture.json` says."""
-
-    noise: NoiseSamples = field(default_factory=NoiseSamples)
-    shifts: dict[str, float | None] = field(default_factory=dict)
-    likeness: list[tuple[Frame, float]] = field(default_factory=list)
-    seconds: list[tuple[Frame, float]] = field(default_factory=list)
-    clipped: list[float] = field(default_factory=list)
-    before: Float32 | None = None
-
-    def add(self, taken: _Taken, values: NDArray[np.floating], shift: float | None) -> None:
-        self.noise.add(values)
-        grid = values[::_GRID, ::_GRID].astype(np.float32)
-        if self.before is not None:
-            self.likeness.append((taken.frame, float(np.nanmean(np.abs(grid - self.before)))))
-        self.before = grid
-        self.shifts[str(taken.frame)] = shift
-        if taken.seconds is not None:
-            self.seconds.append((taken.frame, taken.seconds))
-
-    def doubled(self) -> list[Frame]:
-        """Frames that repeat the one before, while before and after something moves."""
-        differences = [difference for _, difference in self.likeness]
-        repeated = []
-        for number, (frame, difference) in enumerate(self.likeness):
-            around = differences[max(number - 1, 0) : number] + differences[number + 1 : number + 2]
-            if around and min(around) > 0 and difference <= _DOUBLED * min(around):
-                repeated.append(frame)
-        return repeated
-
-    def dropped(self, rate: Fraction | None) -> list[Frame]:
-        """Frames before which at least one is missing by the clock."""
-        if rate is None:
-            return []
-        pairs = zip(self.seconds, self.seconds[1:], strict=False)
-        return [now[0] for before, now in pairs if (now[1] - before[1]) * float(rate) > 1.5]
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height}+{self.x}+{self.y}"
 
 
 def capture(
@@ -150,261 +87,255 @@ def capture(
         device, seconds: a camera's number and how long to record it.
 
     Raises:
-        InputError: nothing usable at ``source``.
+        InputError: nothing usable at ``source``, or wanted frames are not in it.
         OptionError: options that make no sense with the picture or each other.
         ReshootError: with ``strict``, the camera moved.
     """
-    opened = _open(source, device, seconds, run, transfer, start)
+    opened = open_source(
+        source,
+        device=device,
+        seconds=seconds,
+        frames=run.frames,
+        missing=run.missing,
+        transfer=transfer,
+        start=start,
+    )
     if transfer == "auto":
         transfer = opened.transfer
     size = _size(opened.header, crop, scale)
-    suffix = EXR if file_format == "exr" else PNG
-    name = output.resolve().name
-    header = replace(opened.header, width=size[0], height=size[1], origin=(0, 0), provenance={})
     recipe = Recipe(
         "capture",
         {
             "transfer": transfer,
-            "crop": None if crop is None else f"{crop.width}x{crop.height}+{crop.x}+{crop.y}",
+            "crop": None if crop is None else str(crop),
             "scale": scale,
             "format": file_format,
         },
         {"input": opened.name},
     )
-    mark = recipe.fingerprint([opened.fingerprint, str(run.frames), str(start)])
-
-    def place(frame: Frame) -> Path:
-        return output / frame_file(name, frame, suffix)
-
-    if run.resume and (kept := _kept(output, mark, place)) is not None:
+    suffix = EXR if file_format == "exr" else PNG
+    name = output.resolve().name
+    taking = _Taking(opened, recipe, output, name, suffix, transfer, crop, size, run)
+    mark = recipe.fingerprint([opened.fingerprint])
+    if run.resume and (kept := taking.kept(mark)) is not None:
         return kept
-    if opened.frames is not None:
-        refuse_existing(map(place, opened.frames), run)
+    if opened.wanted is not None:
+        refuse_existing(map(taking.place, opened.wanted), run)
     elif output.is_dir():
-        refuse_existing(sorted(output.glob(f"{name}.*{suffix}")), run)
-    reference: list[Float32] = []
-
-    def prepared() -> Iterator[_Taken]:
-        for taken in opened.taken:
-            if not reference:
-                make_folder(output)
-                linear = _linear(taken, transfer, crop, size)
-                reference.append(camera_motion.prepare(luminance(linear)))
-            yield taken
-
-    def work(taken: _Taken) -> tuple[_Taken, NDArray[np.floating], float | None, float]:
-        linear = _linear(taken, transfer, crop, size)
-        path, own = place(taken.frame), recipe.fingerprint([taken.fingerprint])
-        if run.resume and current([path], own) is not None:
-            pass
-        elif suffix == EXR:
-            write_exr(path, {"RGB": to_half(linear)}, header, recipe.provenance(own))
-        else:
-            write_png(path, to_code(linear), recipe.provenance(own))
-        gray = camera_motion.prepare(luminance(linear))
-        shift = camera_motion.shift(reference[0], gray, size[0])
-        top = 1.0 if taken.linear else 0.999
-        clipped = float((taken.values >= top).any(axis=-1).mean())
-        return taken, linear, shift, clipped
-
-    report = _Report()
-    frames: list[Frame] = []
-    rows: dict[str, Any] = {}
-    total = len(opened.frames) if opened.frames is not None else 0
-    run.progress(0, total)
-    for taken, linear, shift, clipped in ordered_map(work, prepared(), run.jobs):
-        frames.append(taken.frame)
-        rows[str(taken.frame)] = {"fingerprint": recipe.fingerprint([taken.fingerprint])}
-        report.add(taken, linear, shift)
-        report.clipped.append(clipped)
-        run.progress(len(frames), max(total, len(frames)))
+        refuse_existing(sorted(f for f in output.iterdir() if f.suffix == suffix), run)
+    frames, skipped, report = taking.take()
     if not frames:
         raise InputError(f"{opened.name}: no frame of the wanted range is in it")
-    record = _record(opened, report, frames, transfer, header)
-    write_json(output / RECORD, record)
-    figures = {
-        key: record[key]
-        for key in (
-            "transfer",
-            "bits",
-            "frame_rate",
-            "camera_motion",
-            "clipped",
-            "dropped",
-            "doubled",
+    absent = [f for f in opened.wanted or () if f not in frames and f not in skipped]
+    if absent and run.missing == "error":
+        raise InputError(
+            f"{opened.name}: has no frames {frame_range(absent)}; its last is {frames[-1]}"
         )
-    }
-    write_manifest(output, recipe, mark, figures, rows)
+    record = _record(opened, report, frames, transfer, size)
+    write_json(output / RECORD, record)
+    figures = {key: record[key] for key in _FIGURES}
+    taking.finish(mark, report.marks, figures)
     _warn(record, strict, output)
-    return Result("capture", output, frames, 0, opened.absent, figures)
+    return Result("capture", output, frames, 0, [*opened.absent, *skipped, *absent], figures)
 
 
-def _open(
-    source: str | Path | None,
-    device: int | None,
-    seconds: float | None,
-    run: Run,
-    transfer: str,
-    start: int | None,
-) -> _Source:
-    if device is not None:
-        if source is not None or seconds is None or seconds <= 0:
-            raise OptionError("--device N takes --seconds T and no INPUT")
-        return _from_camera(device, seconds, FIRST_FRAME if start is None else start)
-    if source is None:
-        raise OptionError("give a movie, a sequence, or --device N --seconds T")
-    path = Path(source)
-    if path.is_file() and path.suffix.lower() not in (EXR, PNG):
-        if not is_movie(path):
-            raise InputError(f"{path}: neither a movie that can be decoded nor EXR or PNG frames")
-        return _from_movie(path, run, transfer, FIRST_FRAME if start is None else start)
-    footage = open_footage(source, "input", transfer, run.missing)
-    return _from_sequence(footage, run, start)
+class _Measured(NamedTuple):
+    """What is kept of a frame once it is written."""
+
+    arriving: Arriving
+    linear: Float32
+    shift: float | None
+    clipped: float
 
 
-def _from_movie(path: Path, run: Run, transfer: str, start: int) -> _Source:
-    movie = Movie(path)
-    info = movie.info
-    if info.transfer is None and transfer == "auto":
-        raise InputError(f"{path}: its transfer function can't be undone here; give --transfer")
-    wanted = None if run.frames is None else set(parse_frames(run.frames))
-    mark = fingerprint_movie(path)
+@dataclass
+class _Report:
+    """Collects, frame by frame in order, what `capture.json` says."""
 
-    def taken() -> Iterator[_Taken]:
-        for item in movie.frames():
-            frame = start + item.position
-            if wanted is None or frame in wanted:
-                yield _Taken(frame, item.seconds, item.coded, False, f"{mark} {item.position}")
+    noise: NoiseSamples = field(default_factory=NoiseSamples)
+    shifts: dict[str, float | None] = field(default_factory=dict)
+    likeness: list[tuple[Frame, float]] = field(default_factory=list)
+    seconds: list[tuple[Frame, float]] = field(default_factory=list)
+    clipped: list[float] = field(default_factory=list)
+    marks: dict[str, str] = field(default_factory=dict)
+    before: Float32 | None = None
 
-    return _Source(
-        name=path.name,
-        fingerprint=mark,
-        header=Header(info.width, info.height, frame_rate=info.frame_rate),
-        transfer=info.transfer or transfer,
-        assumed=list(info.assumed),
-        bits=info.bits,
-        frames=None if wanted is None else sorted(wanted),
-        taken=taken(),
-    )
+    def add(self, measured: _Measured) -> None:
+        frame, seconds = measured.arriving.frame, measured.arriving.seconds
+        self.noise.add(measured.linear)
+        grid = np.nan_to_num(measured.linear[::_GRID, ::_GRID])
+        if self.before is not None:
+            self.likeness.append((frame, float(np.abs(grid - self.before).mean())))
+        self.before = grid
+        self.shifts[str(frame)] = measured.shift
+        self.clipped.append(measured.clipped)
+        if seconds is not None:
+            self.seconds.append((frame, seconds))
 
+    def doubled(self) -> list[Frame]:
+        """Frames that repeat the one before, while before and after something moves."""
+        differences = [difference for _, difference in self.likeness]
+        repeated = []
+        for number, (frame, difference) in enumerate(self.likeness):
+            around = differences[max(number - 1, 0) : number] + differences[number + 1 : number + 2]
+            if around and min(around) > 0 and difference <= _DOUBLED * min(around):
+                repeated.append(frame)
+        return repeated
 
-def _from_sequence(footage: Footage, run: Run, start: int | None) -> _Source:
-    frames, absent = footage.sequence.select(run.frames, run.missing)
-    first = footage.sequence.frames[0]
-    offset = 0 if start is None else start - first
-    rate = footage.header.frame_rate
-    image = read_image(footage.sequence.path(frames[0]))
-    integer = next(iter(image.layers.values())).dtype
-    bits = {"uint8": 8, "uint16": 16}.get(integer.name)
-    kind = "PNG" if bits else "EXR"
-    marks = [fingerprint_file(footage.sequence.path(frame)) for frame in frames]
-
-    def taken() -> Iterator[_Taken]:
-        for frame in frames:
-            stored = footage.image(frame)
-            values = stored.rgb("none")
-            seconds = None if rate is None else float(Fraction(frame - first) / rate)
-            yield _Taken(frame + offset, seconds, values, bits is None, stored.fingerprint)
-
-    return _Source(
-        name=Path(footage.sequence.pattern).name,
-        fingerprint=" ".join(marks),
-        header=footage.header,
-        transfer=footage.transfer,
-        assumed=[f"{kind} frames are taken as {footage.transfer}"],
-        bits=bits,
-        frames=[frame + offset for frame in frames],
-        taken=taken(),
-        absent=absent,
-    )
+    def dropped(self, rate: Fraction | None) -> list[Frame]:
+        """Frames before which at least one is missing by the clock."""
+        if rate is None:
+            return []
+        pairs = zip(self.seconds, self.seconds[1:], strict=False)
+        return [now[0] for before, now in pairs if (now[1] - before[1]) * float(rate) > 1.5]
 
 
-def _from_camera(device: int, seconds: float, start: int) -> _Source:
-    frames = camera_frames(device, seconds)
-    first = next(frames)
-    height, width = first.coded.shape[:2]
-    # A recording is never the same twice.
-    mark = uuid.uuid4().hex
+@dataclass(frozen=True)
+class _Taking:
+    """One run: from the source's frames to files."""
 
-    def taken() -> Iterator[_Taken]:
-        def all_frames() -> Iterator[MovieFrame]:
-            yield first
-            yield from frames
+    source: Source
+    recipe: Recipe
+    output: Path
+    name: str
+    suffix: str
+    transfer: str
+    crop: Crop | None
+    size: tuple[int, int]
+    run: Run
 
-        for item in all_frames():
-            yield _Taken(start + item.position, item.seconds, item.coded, False, mark)
+    def place(self, frame: Frame) -> Path:
+        return self.output / frame_file(self.name, frame, self.suffix)
 
-    return _Source(
-        name=f"camera {device}",
-        fingerprint=mark,
-        header=Header(width, height),
-        transfer="srgb",
-        assumed=["cameras are taken as sRGB-encoded, 8 bit"],
-        bits=8,
-        frames=None,
-        taken=taken(),
-    )
+    def mark(self, arriving: Arriving) -> str:
+        return self.recipe.fingerprint([arriving.fingerprint])
 
+    def take(self) -> tuple[list[Frame], list[Frame], _Report]:
+        """Write all frames; those written, those skipped, and what was measured."""
+        report, frames, skipped = _Report(), list[Frame](), list[Frame]()
+        reference: list[Float32] = []
 
-def _kept(output: Path, mark: str, place: Callable[[Frame], Path]) -> Result | None:
-    """The result of an earlier run of the same, if all that it wrote is still there and whole."""
-    manifest = read_manifest(output)
-    rows, figures = manifest.get("frames"), manifest.get("figures")
-    if manifest.get("fingerprint") != mark or not isinstance(rows, dict) or figures is None:
-        return None
-    try:
-        frames = parse_frames(",".join(rows))
-    except OptionError:
-        return None
-    whole = (output / RECORD).is_file() and all(
-        current([place(frame)], rows[str(frame)]["fingerprint"]) is not None for frame in frames
-    )
-    if not whole:
-        return None
-    write_json(output / MANIFEST, manifest)
-    return Result("capture", output, frames, len(frames), (), figures)
+        def prepared() -> Iterator[Arriving]:
+            for arriving in self.source.arriving:
+                # The first frame that can be read is what the camera's motion is measured from.
+                if not reference:
+                    try:
+                        linear = self._linear(arriving.load().values)
+                    except DamagedFileError:
+                        if self.run.missing == "error":
+                            raise
+                    else:
+                        make_folder(self.output)
+                        reference.append(camera_motion.prepare(luminance(linear)))
+                yield arriving
+
+        def work(arriving: Arriving) -> _Measured | Frame:
+            try:
+                return self._write(arriving, reference[0] if reference else None)
+            except DamagedFileError:
+                if self.run.missing == "error":
+                    raise
+                return arriving.frame
+
+        total = self.source.total
+        self.run.progress(0, total)
+        for number, done in enumerate(ordered_map(work, prepared(), self.run.jobs), start=1):
+            if isinstance(done, _Measured):
+                frames.append(done.arriving.frame)
+                report.add(done)
+                report.marks[str(done.arriving.frame)] = self.mark(done.arriving)
+            else:
+                skipped.append(done)
+            self.run.progress(number, max(total, number) if total else 0)
+        return frames, skipped, report
+
+    def _write(self, arriving: Arriving, reference: Float32 | None) -> _Measured:
+        loaded = arriving.load()
+        linear = self._linear(loaded.values)
+        path, mark = self.place(arriving.frame), self.mark(arriving)
+        if not (self.run.resume and current([path], mark) is not None):
+            provenance = self.recipe.provenance(mark)
+            if self.suffix == EXR:
+                width, height = self.size
+                origin = loaded.header.origin if self.size == loaded.header.size else (0, 0)
+                header = replace(loaded.header, width=width, height=height, origin=origin)
+                write_exr(path, {"RGB": to_half(linear)}, header, provenance)
+            else:
+                write_png(path, to_code(linear), provenance)
+        gray = camera_motion.prepare(luminance(linear))
+        shift = None if reference is None else camera_motion.shift(reference, gray, self.size[0])
+        top = 1.0 if self.source.bits is None else _CLIPPED_CODE
+        return _Measured(arriving, linear, shift, float((loaded.values >= top).any(axis=-1).mean()))
+
+    def _linear(self, coded: NDArray[np.floating]) -> Float32:
+        values = TRANSFERS[self.transfer].decode(coded)
+        if (crop := self.crop) is not None:
+            values = values[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
+        if (values.shape[1], values.shape[0]) != self.size:
+            smaller = self.size[0] < values.shape[1]
+            method = cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
+            whole = np.ascontiguousarray(values)
+            values = np.asarray(cv2.resize(whole, self.size, interpolation=method), np.float32)
+        return values
+
+    def kept(self, mark: str) -> Result | None:
+        """The result of an earlier run of the same, if all that it wrote is there and whole."""
+        manifest = read_record(self.output / MANIFEST)
+        rows, figures = manifest.get("frames"), manifest.get("figures")
+        if manifest.get("fingerprint") != mark or not isinstance(rows, dict) or figures is None:
+            return None
+        wanted = self.source.wanted
+        numbers = [str(frame) for frame in wanted] if wanted is not None else list(rows)
+        marks = {number: rows.get(number, {}).get("fingerprint") for number in numbers}
+        try:
+            frames: list[Frame] = list(wanted) if wanted is not None else [int(n) for n in numbers]
+        except ValueError:
+            return None
+        whole = read_record(self.output / RECORD) and all(
+            current([self.place(frame)], str(marks[str(frame)])) is not None for frame in frames
+        )
+        if not whole:
+            return None
+        # Written anew, so that make sees that the step has been looked after.
+        write_json(self.output / MANIFEST, manifest)
+        return Result("capture", self.output, frames, len(frames), self.source.absent, figures)
+
+    def finish(self, mark: str, marks: dict[str, str], figures: Figures) -> None:
+        """Write the manifest, together with what other chunks of the same wrote."""
+        rows: dict[str, Any] = {frame: {"fingerprint": own} for frame, own in marks.items()}
+        with folder_lock(self.output):
+            before = read_record(self.output / MANIFEST)
+            if before.get("fingerprint") == mark and isinstance(before.get("frames"), dict):
+                rows = {**before["frames"], **rows}
+            write_manifest(self.output, self.recipe, mark, figures, rows)
 
 
 def _size(header: Header, crop: Crop | None, scale: float) -> tuple[int, int]:
     width, height = header.size
     if crop is not None:
         if crop.x + crop.width > width or crop.y + crop.height > height:
-            raise OptionError(
-                f"--crop {crop.width}x{crop.height}+{crop.x}+{crop.y} reaches outside the"
-                f" picture of {width}x{height}"
-            )
+            raise OptionError(f"--crop {crop}: reaches outside the picture of {width}x{height}")
         width, height = crop.width, crop.height
     if not 0 < scale <= 16:
         raise OptionError(f"--scale {scale}: must be above 0 and at most 16")
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _linear(taken: _Taken, transfer: str, crop: Crop | None, size: tuple[int, int]) -> Float32:
-    values = TRANSFERS[transfer].decode(taken.values)
-    if crop is not None:
-        values = values[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
-    if (values.shape[1], values.shape[0]) != size:
-        smaller = size[0] < values.shape[1]
-        method = cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
-        values = np.asarray(cv2.resize(np.ascontiguousarray(values), size, interpolation=method))
-    return np.asarray(values, np.float32)
-
-
 def _record(
-    opened: _Source, report: _Report, frames: list[Frame], transfer: str, header: Header
+    source: Source, report: _Report, frames: list[Frame], transfer: str, size: tuple[int, int]
 ) -> dict[str, Any]:
     measured = {f: s for f, s in report.shifts.items() if s is not None}
     most = max(measured, key=lambda f: measured[f]) if measured else None
     moved = next((f for f, s in measured.items() if s > _MOVED), None)
-    rate = opened.header.frame_rate
+    rate = source.header.frame_rate
     return {
-        "input": opened.name,
+        "input": source.name,
         "frames": frame_range(frames),
-        "width": header.width,
-        "height": header.height,
-        "bits": opened.bits,
+        "width": size[0],
+        "height": size[1],
+        "bits": source.bits,
         "transfer": transfer,
-        "assumed": opened.assumed,
+        "assumed": source.assumed,
         "frame_rate": None if rate is None else str(rate),
         "dropped": [str(f) for f in report.dropped(rate)],
         "doubled": [str(f) for f in report.doubled()],

@@ -23,7 +23,7 @@ from shadowtool.io.image import (
 )
 from shadowtool.io.products import read_plates, read_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
-from shadowtool.steps.footage import require_size
+from shadowtool.steps.footage import require_frames, require_size
 from shadowtool.steps.matte import BETA_FOLDER, FIGURE_FOLDER
 from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
 
@@ -63,15 +63,11 @@ def composite(
     figure_frames = open_sequence(foreground or _part(mattes, FIGURE_FOLDER), "figure")
     beta_frames = open_sequence(beta or _part(mattes, BETA_FOLDER), "β")
     frames, absent = beta_frames.select(run.frames, run.missing)
-    absent += [f for f in frames if f not in figure_frames.files and run.missing == "skip"]
-    frames = [frame for frame in frames if frame not in absent]
     stored = read_plates(plates)
     lit, shadow, repaired = _complete(stored.plates.lit, stored.plates.shadow)
     header = stored.header
-    for frame in frames:
-        for sequence in (figure_frames, beta_frames):
-            path = sequence.path(frame)
-            require_size(path, read_header(path), header, f"the plates in {plates}")
+    for sequence in (figure_frames, beta_frames):
+        require_frames(sequence, frames, header, f"the plates in {plates}", run.missing)
     warp_map: WarpMap | None = None
     shared = [stored.fingerprint]
     if warp is not None:

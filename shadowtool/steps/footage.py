@@ -1,5 +1,6 @@
 """Footage: a sequence whose frames are known to fit together, read as linear light."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,6 +93,24 @@ def open_footage(
     if first is None:
         raise DamagedFileError(f"{sequence.pattern}: no frame can be read")
     return Footage(sequence, first, resolve_transfer(transfer, next(iter(sequence.files.values()))))
+
+
+def require_frames(
+    sequence: Sequence, frames: Iterable[Frame], expected: Header, of: str, missing: Missing
+) -> None:
+    """Raise InputError unless a sequence has all these frames, as large as they should be.
+
+    With ``missing`` "skip", frames that are absent or damaged pass; they are skipped in their turn.
+    """
+    for frame in frames:
+        try:
+            path = sequence.path(frame)
+            header = read_header(path)
+        except InputError:
+            if missing == "error":
+                raise
+            continue
+        require_size(path, header, expected, of)
 
 
 def require_size(path: Path, header: Header, expected: Header, of: str) -> None:

@@ -15,10 +15,10 @@ from shadowtool.core.matting import (
     pull_figure,
 )
 from shadowtool.errors import OptionError
-from shadowtool.io.image import EXR, PNG, read_header, read_image, to_half, write_exr, write_png
+from shadowtool.io.image import EXR, PNG, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import read_plates
-from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
-from shadowtool.steps.footage import open_footage, require_size
+from shadowtool.io.sequence import Frame, frame_file, open_sequence
+from shadowtool.steps.footage import open_footage, require_frames, require_size
 from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
 
 Float32 = NDArray[np.float32]
@@ -57,14 +57,13 @@ def matte(
     if alpha is not None and only == "trimap":
         raise OptionError("--only trimap makes trimaps, which --alpha replaces; give one of them")
     given = {
-        role: _open_matte(role, path, frames, run)
+        role: open_sequence(path, role)
         for role, path in (("alpha", alpha), ("trimap", trimap))
         if path is not None
     }
     for sequence in given.values():
-        for frame in frames:
-            path = sequence.path(frame)
-            require_size(path, read_header(path), footage.header, footage.sequence.pattern)
+        pattern = footage.sequence.pattern
+        require_frames(sequence, frames, footage.header, pattern, run.missing)
     noise = footage.measure_noise(run.jobs)
     scene = stored.plates
     never_shaded = shadow_beta.unknown_beta(
@@ -107,7 +106,9 @@ def matte(
         return [s.path(frame) for s in (footage.sequence, *given.values())]
 
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
-        image = footage.read(frame).astype(np.float32)
+        stored_frame = footage.image(frame)
+        header = stored_frame.header
+        image = stored_frame.rgb(footage.transfer).astype(np.float32)
         bad = ~np.isfinite(image).all(axis=-1)
         image[bad] = np.nan
         if "alpha" in given:
@@ -138,12 +139,12 @@ def matte(
             figure = pull_figure(image, coverage, shade(scene.lit, scene.shadow, behind))
             rgba = np.dstack([figure.foreground, figure.alpha])
             marked = with_figures(provenance, figures)
-            write_exr(file(FIGURE_FOLDER, frame), {"RGBA": to_half(rgba)}, footage.header, marked)
+            write_exr(file(FIGURE_FOLDER, frame), {"RGBA": to_half(rgba)}, header, marked)
         if wanted("beta"):
             confidence = np.where(unknown, np.float32(0), known_confidence)
             layers = {"Y": to_half(filled), "confidence": to_half(confidence)}
             marked = with_figures(provenance, figures)
-            write_exr(file(BETA_FOLDER, frame), layers, footage.header, marked)
+            write_exr(file(BETA_FOLDER, frame), layers, header, marked)
         return figures
 
     def summary(rows: list[Figures]) -> Figures:
@@ -152,14 +153,6 @@ def matte(
 
     work = FrameWork(recipe, output, products, sources, [stored.fingerprint], make)
     return work.run(frames, run, absent, summary)
-
-
-def _open_matte(role: str, path: str | Path, frames: list[Frame], run: Run) -> Sequence:
-    sequence = open_sequence(path, role)
-    lacking = [frame for frame in frames if frame not in sequence.files]
-    if lacking and run.missing == "error":
-        sequence.path(lacking[0])
-    return sequence
 
 
 def _matte_plane(path: Path) -> Float32:

@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.choices import Estimator
+from shadowtool.choices import Estimator, Missing
 from shadowtool.core.beta import shadow_contrast
 from shadowtool.core.noise import noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.plates import ExtremePlates
-from shadowtool.errors import DamagedFileError
+from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.files import fingerprint_file, make_folder
-from shadowtool.io.image import Image, read_header, read_image
+from shadowtool.io.image import Image, read_image
 from shadowtool.io.products import MANIFEST, plate_files, write_plates
 from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
-from shadowtool.steps.footage import Footage, open_footage, require_size
+from shadowtool.steps.footage import Footage, open_footage, require_frames, require_size
 from shadowtool.steps.run import Recipe, Result, Run, refuse_existing, unchanged, write_manifest
 
 logger = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def plate(
     """
     footage = open_footage(source, "frames", transfer, run.missing)
     frames, absent = footage.sequence.select(run.frames, run.missing)
-    held = None if holdout is None else _open_holdout(holdout, frames, footage)
+    held = None if holdout is None else _open_holdout(holdout, frames, footage, run.missing)
     refuse_existing([*plate_files(output), output / MANIFEST], run)
     inputs = {"frames": Path(footage.sequence.pattern).name}
     if held is not None:
@@ -63,7 +63,7 @@ def plate(
         try:
             image = footage.image(frame)
             matte = None if held is None else _read_holdout(held.path(frame), footage)
-        except DamagedFileError:
+        except InputError:
             if run.missing == "skip":
                 return None
             raise
@@ -116,10 +116,11 @@ def plate(
     return Result("plate", output, used, 0, skipped, figures)
 
 
-def _open_holdout(holdout: str | Path, frames: list[Frame], footage: Footage) -> Sequence:
+def _open_holdout(
+    holdout: str | Path, frames: list[Frame], footage: Footage, missing: Missing
+) -> Sequence:
     sequence = open_sequence(holdout, "holdout")
-    for frame in frames:
-        require_size(path := sequence.path(frame), read_header(path), footage.header, "the footage")
+    require_frames(sequence, frames, footage.header, "the footage", missing)
     return sequence
 
 

@@ -11,8 +11,8 @@ from shadowtool import __version__
 from shadowtool.choices import Missing
 from shadowtool.errors import DamagedFileError, InputError, OutputExistsError
 from shadowtool.io.files import fingerprint_file, make_folder
-from shadowtool.io.image import EXR, read_image
-from shadowtool.io.products import MANIFEST, folder_lock, read_manifest, write_json
+from shadowtool.io.image import EXR, PNG, read_image
+from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame
 from shadowtool.parallel import ordered_map
 
@@ -183,7 +183,7 @@ class FrameWork:
     ) -> Figures:
         key = self.recipe.fingerprint(self.shared)
         with folder_lock(self.output):
-            before = read_manifest(self.output)
+            before = read_record(self.output / MANIFEST)
             if before.get("fingerprint") == key and isinstance(before.get("frames"), dict):
                 rows = {**before["frames"], **rows}
             figures = summary(list(rows.values()))
@@ -214,13 +214,17 @@ def current(files: list[Path], mark: str) -> Figures | None:
 
 def unchanged(output: Path, products: Iterable[Path], mark: str) -> Figures | None:
     """For steps with one result: the figures of an earlier run that can be kept, else None."""
-    manifest = read_manifest(output)
+    manifest = read_record(output / MANIFEST)
     if manifest.get("fingerprint") != mark:
         return None
-    if current([file for file in products if file.suffix == EXR], mark) is None:
-        return None
     figures = manifest.get("figures")
-    if not isinstance(figures, dict) or not all(file.is_file() for file in products):
+    if not isinstance(figures, dict):
+        return None
+    pictures = [file for file in products if file.suffix in (EXR, PNG)]
+    records = [file for file in products if file.suffix not in (EXR, PNG)]
+    if current(pictures, mark) is None:
+        return None
+    if any(read_record(file).get("fingerprint") != mark for file in records):
         return None
     # Written anew, so that make sees that the step has been looked after.
     write_json(output / MANIFEST, manifest)

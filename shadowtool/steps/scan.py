@@ -68,7 +68,7 @@ def scan(
     if len(frames) < 3:
         raise InputError(f"{footage.sequence.pattern}: {len(frames)} frames make no sweep")
     region, plane_mark = read_plane(plane, footage.header)
-    products = [output / SCAN, output / LINES]
+    products = [output / SCAN, output / LINES, output / PICTURE]
     refuse_existing([*products, output / MANIFEST], run)
     recipe = Recipe(
         "scan",

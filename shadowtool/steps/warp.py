@@ -66,7 +66,7 @@ def solve_warp(
     )
     mark = recipe.fingerprint(fingerprint for _, _, fingerprint in read)
     if run.resume:
-        figures = unchanged(output, [output / WARP], mark)
+        figures = unchanged(output, [output / WARP, output / PICTURE], mark)
         if figures is not None:
             return Result("warp", output, [], 1, (), figures)
     passes = [scan for scan, _, _ in read]
@@ -117,8 +117,9 @@ def apply_warp(
     warp_map, header, map_mark = read_warp(map_file)
     frames_in = open_sequence(source, "frames to warp")
     frames, absent = frames_in.select(run.frames, run.missing)
-    for frame in frames:
-        read_header(frames_in.path(frame))
+    if run.missing == "error":
+        for frame in frames:
+            read_header(frames_in.path(frame))
     folder = output / frames_in.name
     recipe = Recipe(
         "warp",

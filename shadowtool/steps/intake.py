@@ -1,0 +1,207 @@
+"""Where captured frames come from: a movie, a sequence, or a camera."""
+
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import partial
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.choices import Missing
+from shadowtool.errors import InputError, OptionError
+from shadowtool.io.files import fingerprint_file, fingerprint_movie
+from shadowtool.io.image import EXR, PNG, Header, read_image
+from shadowtool.io.sequence import Frame, parse_frames
+from shadowtool.io.video import Movie, camera_frames, is_movie
+from shadowtool.steps.footage import open_footage
+
+FIRST_FRAME = 1001
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A frame's code values (H, W, 3), and its header."""
+
+    values: NDArray[np.floating]
+    header: Header
+
+
+@dataclass(frozen=True)
+class Arriving:
+    """A frame on its way in.
+
+    Attributes:
+        frame: the number that it gets.
+        seconds: when it was taken, None if unknown.
+        fingerprint: of what it is made of.
+        load: reads it; raises DamagedFileError.
+    """
+
+    frame: Frame
+    seconds: float | None
+    fingerprint: str
+    load: Callable[[], Loaded]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Frames to capture, and what is known of them beforehand.
+
+    Attributes:
+        name: as a person would say it.
+        fingerprint: of the whole source.
+        header: the first frame's.
+        transfer: the transfer function that was found or assumed.
+        assumed: sentences about what the source left open.
+        bits: of each sample; None for floating point.
+        wanted: the numbers of the frames that were asked for; None for whatever comes.
+        total: how many frames there will be, 0 if unknown.
+        arriving: the frames, in order; to be gone through once.
+        absent: frames that are known to be missing.
+    """
+
+    name: str
+    fingerprint: str
+    header: Header
+    transfer: str
+    assumed: list[str]
+    bits: int | None
+    wanted: list[Frame] | None
+    total: int
+    arriving: Iterator[Arriving]
+    absent: list[Frame] = field(default_factory=list)
+
+
+def open_source(
+    source: str | Path | None,
+    *,
+    device: int | None,
+    seconds: float | None,
+    frames: str | None,
+    missing: Missing,
+    transfer: str,
+    start: int | None,
+) -> Source:
+    """Find out what a source is and open it.
+
+    Raises:
+        InputError: there is nothing usable.
+        OptionError: neither or both of a source and a camera are given.
+    """
+    if device is not None:
+        if source is not None or seconds is None or seconds <= 0:
+            raise OptionError("--device N takes --seconds T and no INPUT")
+        return _camera(device, seconds, FIRST_FRAME if start is None else start)
+    if source is None:
+        raise OptionError("give a movie, a sequence, or --device N --seconds T")
+    path = Path(source)
+    if path.is_file() and path.suffix.lower() not in (EXR, PNG):
+        if not is_movie(path):
+            raise InputError(f"{path}: neither a movie that can be decoded nor EXR or PNG frames")
+        return _movie(path, frames, transfer, FIRST_FRAME if start is None else start)
+    return _sequence(source, frames, missing, transfer, start)
+
+
+def _same(loaded: Loaded) -> Loaded:
+    return loaded
+
+
+def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
+    movie = Movie(path)
+    info = movie.info
+    if info.transfer is None and transfer == "auto":
+        raise InputError(f"{path}: its transfer function can't be undone here; give --transfer")
+    wanted = None if frames is None else parse_frames(frames)
+    chosen = None if wanted is None else set(wanted)
+    mark = fingerprint_movie(path)
+    header = Header(info.width, info.height, frame_rate=info.frame_rate)
+
+    def arriving() -> Iterator[Arriving]:
+        for item in movie.frames():
+            frame = start + item.position
+            if chosen is None or frame in chosen:
+                loaded = Loaded(item.coded, header)
+                yield Arriving(
+                    frame, item.seconds, f"{mark} {item.position}", partial(_same, loaded)
+                )
+            if chosen is not None and frame >= max(chosen):
+                return
+
+    return Source(
+        name=path.name,
+        fingerprint=mark,
+        header=header,
+        transfer=info.transfer or transfer,
+        assumed=list(info.assumed),
+        bits=info.bits,
+        wanted=wanted,
+        total=len(wanted) if wanted is not None else info.frames or 0,
+        arriving=arriving(),
+    )
+
+
+def _sequence(
+    source: str | Path, frames: str | None, missing: Missing, transfer: str, start: int | None
+) -> Source:
+    footage = open_footage(source, "input", transfer, missing)
+    present, absent = footage.sequence.select(frames, missing)
+    first = footage.sequence.frames[0]
+    offset = 0 if start is None else start - first
+    rate = footage.header.frame_rate
+    png = footage.sequence.path(present[0]).suffix.lower() == PNG
+    marks = {frame: fingerprint_file(footage.sequence.path(frame)) for frame in present}
+
+    def load(frame: Frame) -> Loaded:
+        image = footage.image(frame)
+        return Loaded(image.rgb("none"), image.header)
+
+    def arriving() -> Iterator[Arriving]:
+        for frame in present:
+            seconds = None if rate is None else float(Fraction(frame - first) / rate)
+            yield Arriving(frame + offset, seconds, marks[frame], partial(load, frame))
+
+    bits = None
+    if png:
+        stored = next(iter(read_image(footage.sequence.path(present[0])).layers.values()))
+        bits = 8 * stored.dtype.itemsize
+    return Source(
+        name=Path(footage.sequence.pattern).name,
+        fingerprint=" ".join(marks.values()),
+        header=footage.header,
+        transfer=footage.transfer,
+        assumed=[f"{'PNG' if png else 'EXR'} frames are taken as {footage.transfer}"],
+        bits=bits,
+        wanted=[frame + offset for frame in present],
+        total=len(present),
+        arriving=arriving(),
+        absent=[frame + offset for frame in absent],
+    )
+
+
+def _camera(device: int, seconds: float, start: int) -> Source:
+    frames = camera_frames(device, seconds)
+    first = next(frames)
+    header = Header(first.coded.shape[1], first.coded.shape[0])
+    # A recording is never the same twice.
+    mark = uuid.uuid4().hex
+
+    def arriving() -> Iterator[Arriving]:
+        for item in chain([first], frames):
+            loaded = Loaded(item.coded, header)
+            yield Arriving(start + item.position, item.seconds, mark, partial(_same, loaded))
+
+    return Source(
+        name=f"camera {device}",
+        fingerprint=mark,
+        header=header,
+        transfer="srgb",
+        assumed=["cameras are taken as sRGB-encoded, 8 bit"],
+        bits=8,
+        wanted=None,
+        total=0,
+        arriving=arriving(),
+    )

@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 def available_cpus() -> int:
     """The CPUs that this process may use: what Slurm granted, or the affinity mask."""
     granted = os.environ.get("SLURM_CPUS_PER_TASK", "")
-    if granted.isdigit() and int(granted) > 0:
+    if granted.isascii() and granted.isdigit() and int(granted) > 0:
         return int(granted)
     return len(os.sched_getaffinity(0))
 

@@ -1,6 +1,8 @@
 """Each shared option, once."""
 
+import contextlib
 import functools
+import io
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -107,7 +109,9 @@ def step_command(function: Function) -> Function:
         from shadowtool.steps.run import Run
 
         name = click.get_current_context().info_name or ""
-        with reporter(progress if not quiet else "none", name) as advance:
+        # OpenEXR prints a warning of its own for a damaged file; stdout is for results.
+        silence = contextlib.nullcontext() if verbose else contextlib.redirect_stdout(io.StringIO())
+        with silence, reporter(progress if not quiet else "none", name) as advance:
             run = Run(frames, missing, jobs, overwrite, resume, advance)  # type: ignore[arg-type]
             results = function(run=run, **others)
         if not quiet:

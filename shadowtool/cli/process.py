@@ -8,6 +8,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
@@ -16,16 +17,25 @@ import click
 from shadowtool.cli.commands import shadowtool
 from shadowtool.errors import ShadowtoolError
 
-SKIPPED, INTERRUPTED, TERMINATED = 3, 130, 143
+INTERRUPTED, TERMINATED = 130, 143
+# A message longer than this is one with an absurd path in it.
+_LONGEST = 1000
 
 
 class _Terminated(BaseException):
     """SIGTERM arrived."""
 
 
+class _Interrupted(BaseException):
+    """SIGINT arrived; not a KeyboardInterrupt, at which click writes an empty line."""
+
+
 def run_process() -> NoReturn:
     """Run the command line of this process and end it with its exit code."""
     signal.signal(signal.SIGTERM, _terminate)
+    # A shell starts background jobs with SIGINT ignored; that is to stay so.
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _interrupt)
     if "-v" not in sys.argv and "--verbose" not in sys.argv:
         _silence_libraries()
     code = run_command(sys.argv[1:])
@@ -48,7 +58,7 @@ def run_command(arguments: Sequence[str]) -> int:
     except ShadowtoolError as error:
         _say(str(error))
         return error.exit_code
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, click.Abort, _Interrupted):
         _say("interrupted; finished frames are whole, --resume goes on from here")
         return INTERRUPTED
     except _Terminated:
@@ -56,6 +66,12 @@ def run_command(arguments: Sequence[str]) -> int:
         return TERMINATED
     except BrokenPipeError:
         return 1
+    except OSError as error:
+        from shadowtool.io.files import translated
+
+        fault = translated(error, Path(str(error.filename or "a file")), "read")
+        _say(str(fault))
+        return fault.exit_code
     except MemoryError:
         _say("out of memory; give a smaller --jobs or run on a larger machine")
         return 75
@@ -71,13 +87,19 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _say(message: str) -> None:
-    line = " ".join(message.split("\n"))
+    line = "".join(c if c.isprintable() else " " for c in message)
+    if len(line) > _LONGEST:
+        line = f"{line[: _LONGEST // 2]}…{line[-_LONGEST // 2 :]}"
     with contextlib.suppress(OSError):
         print(f"shadowtool: error: {line}", file=sys.stderr, flush=True)
 
 
 def _terminate(number: int, frame: FrameType | None) -> NoReturn:
     raise _Terminated
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    raise _Interrupted
 
 
 def _silence_libraries() -> None:

@@ -48,23 +48,26 @@ class ExtremePlates:
         """Take one frame in.
 
         Args:
-            image: (H, W, 3) float16 or float32, linear light, the same type and size in every
-                call. A pixel with a NaN or infinity in any channel counts as not seen.
+            image: (H, W, 3) float16 or float32, linear light, the same size in every call. A
+                pixel with a NaN or infinity in any channel counts as not seen.
             holdout: (H, W) of any type; where above 0 the pixel is out.
 
         Raises:
-            ValueError: the shape or type differs from that of the first frame.
+            ValueError: the shape differs from that of the first frame.
         """
         keys = _order_keys(image)
         if self._lowest is None or self._highest is None or self._frames is None:
-            top = np.iinfo(np.int16).max if keys.dtype == np.int16 else np.float32(np.inf)
-            self._lowest = np.full(image.shape, top, keys.dtype)
-            self._highest = np.full(image.shape, -top, keys.dtype)
+            # For halfs the integers that stand for infinity: both survive going over to floats.
+            infinity = _order_keys(np.full((1, 1, 3), np.inf, image.dtype))[0, 0, 0]
+            self._lowest = np.full(image.shape, infinity, keys.dtype)
+            self._highest = np.full(image.shape, ~infinity if keys.dtype == np.int16 else -infinity)
             self._frames = np.zeros(image.shape[:2], np.uint32)
-        if keys.shape != self._lowest.shape or keys.dtype != self._lowest.dtype:
-            raise ValueError(
-                f"a frame of {keys.shape} {image.dtype} among frames of {self._lowest.shape}"
-            )
+        if keys.shape != self._lowest.shape:
+            raise ValueError(f"a frame of {keys.shape} among frames of {self._lowest.shape}")
+        if keys.dtype != self._lowest.dtype:
+            # Halfs and floats in one take: go on in float, which holds every half.
+            keys = _values(keys)
+            self._lowest, self._highest = _values(self._lowest), _values(self._highest)
         seen = _seen(image, holdout)
         if seen is None:
             np.minimum(self._lowest, keys, out=self._lowest)

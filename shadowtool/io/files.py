@@ -1,11 +1,13 @@
 """Whole files, read at once and written whole or not at all."""
 
+import contextlib
 import errno
 import itertools
 import os
 import socket
 import threading
 import zlib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from shadowtool.errors import InputError, RetryError, ShadowtoolError
@@ -33,7 +35,7 @@ def read_bytes(path: Path) -> bytes:
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
-        raise _translated(error, path, "read") from None
+        raise translated(error, path, "read") from None
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
@@ -53,11 +55,39 @@ def write_bytes(path: Path, data: bytes | memoryview) -> None:
             temporary.unlink(missing_ok=True)
             raise
     except OSError as error:
-        raise _translated(error, path, "write") from None
+        raise translated(error, path, "write") from None
 
 
 def _name() -> str:
     return f"{threading.get_ident():x}-{next(_counter)}"
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there, also under a name that can't be one."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+@contextlib.contextmanager
+def new_folders(paths: Iterable[Path]) -> Iterator[None]:
+    """Make output folders; if what follows fails, those that are new and still empty go again.
+
+    Raises:
+        RetryError, ShadowtoolError: as `write_bytes`.
+    """
+    new: list[Path] = []
+    try:
+        for path in paths:
+            new += [folder for folder in (*reversed(path.parents), path) if not folder.exists()]
+            make_folder(path)
+        yield
+    except BaseException:
+        for folder in reversed(new):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def make_folder(path: Path) -> None:
@@ -74,7 +104,7 @@ def make_folder(path: Path) -> None:
     except FileExistsError:
         raise ShadowtoolError(f"{path}: a file stands where the output folder should be") from None
     except OSError as error:
-        raise _translated(error, path, "write") from None
+        raise translated(error, path, "write") from None
 
 
 def _alive(pid: str) -> bool:
@@ -117,11 +147,12 @@ def fingerprint_movie(path: Path) -> str:
             file.seek(max(size - _SAMPLE, 0))
             check = zlib.crc32(file.read(), check)
     except OSError as error:
-        raise _translated(error, path, "read") from None
+        raise translated(error, path, "read") from None
     return f"{size}:{check:08x}"
 
 
-def _translated(error: OSError, path: Path, verb: str) -> ShadowtoolError:
+def translated(error: OSError, path: Path, verb: str) -> ShadowtoolError:
+    """What an OSError comes to: worth retrying, or the user's to mend."""
     reason = error.strerror or str(error)
     if error.errno in _RETRY:
         return RetryError(f"{path}: cannot {verb}: {reason}; free the resource and run again")

@@ -4,11 +4,12 @@ EXR pixels are taken as linear light, PNG as sRGB-encoded, unless the caller nam
 function.
 """
 
+import contextlib
 import io
 import logging
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
@@ -124,11 +125,8 @@ class Image:
             InputError: no such channel.
         """
         for name in names:
-            if name in self.layers and self.layers[name].ndim == 2:
-                return _unit(self.layers[name])
-            for layer, values in self.layers.items():
-                if layer in ("RGB", "RGBA") and len(name) == 1 and name in layer:
-                    return _unit(values[..., layer.index(name)])
+            with contextlib.suppress(InputError):
+                return self.channel(name)
         only = list(self.layers.values())
         if len(only) == 1 and only[0].ndim == 2:
             return _unit(only[0])
@@ -137,6 +135,19 @@ class Image:
         raise InputError(
             f"{self.path}: has no channel {' or '.join(names)}, only {', '.join(self.layers)}"
         )
+
+    def channel(self, name: str) -> Float32:
+        """One channel (H, W) as float32, by its exact name.
+
+        Raises:
+            InputError: the file has no channel of that name.
+        """
+        for layer, values in self.layers.items():
+            if layer == name and values.ndim == 2:
+                return _unit(values)
+            if layer in ("RGB", "RGBA") and len(name) == 1 and name in layer:
+                return _unit(values[..., layer.index(name)])
+        raise InputError(f"{self.path}: has no channel {name}, only {', '.join(self.layers)}")
 
     def _colour_layer(self) -> str:
         for name in ("RGB", "RGBA"):
@@ -279,8 +290,7 @@ def write_png(
     data = buffer.tobytes()
     # Text chunks may stand anywhere between the header (33 bytes with the signature) and the end.
     texts = b"".join(
-        _png_chunk(b"tEXt", f"{_ATTRIBUTE}{key}".encode("latin-1") + b"\0" + _latin(value))
-        for key, value in (provenance or {}).items()
+        _png_text(_ATTRIBUTE + key, value) for key, value in (provenance or {}).items()
     )
     write_bytes(path, data[:33] + texts + data[33:])
 
@@ -412,17 +422,25 @@ def _png_header(path: Path, data: bytes) -> Header:
 
 def _png_texts(data: bytes) -> dict[str, str]:
     texts = {}
+    for kind, content in _png_chunks(data):
+        key, _, value = content.partition(b"\0")
+        name = key.decode("latin-1")
+        if kind == b"IDAT":
+            break
+        if name.startswith(_ATTRIBUTE) and kind == b"tEXt":
+            texts[name.removeprefix(_ATTRIBUTE)] = value.decode("latin-1")
+        elif name.startswith(_ATTRIBUTE) and kind == b"iTXt":
+            texts[name.removeprefix(_ATTRIBUTE)] = value[4:].decode("utf-8", "replace")
+    return texts
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Kind and content of each chunk, as far as the data goes."""
     position = len(_PNG_SIGNATURE)
     while position + 8 <= len(data):
         length, kind = struct.unpack(">I4s", data[position : position + 8])
-        if kind == b"IDAT":
-            break
-        if kind == b"tEXt":
-            key, _, value = data[position + 8 : position + 8 + length].partition(b"\0")
-            if key.startswith(_ATTRIBUTE.encode()):
-                texts[key.decode("latin-1").removeprefix(_ATTRIBUTE)] = value.decode("latin-1")
+        yield kind, data[position + 8 : position + 8 + length]
         position += length + 12
-    return texts
 
 
 def _png_chunk(kind: bytes, content: bytes) -> bytes:
@@ -430,14 +448,20 @@ def _png_chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", check)
 
 
-def _latin(text: str) -> bytes:
-    return text.encode("latin-1", "replace")
+def _png_text(key: str, value: str) -> bytes:
+    """A tEXt chunk, or iTXt where Latin-1 can't say it."""
+    try:
+        return _png_chunk(b"tEXt", key.encode("latin-1") + b"\0" + value.encode("latin-1"))
+    except UnicodeEncodeError:
+        # Not compressed, and no language is named.
+        text = value.encode("utf-8", "replace")
+        return _png_chunk(b"iTXt", key.encode("ascii") + b"\0\0\0\0\0" + text)
 
 
 def _decode_png(path: Path, data: bytes) -> Image:
     header = _png_header(path, data)
     # A cut-off PNG decodes to a picture that is grey from there on; its end marker is missing.
-    whole = data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82")
+    whole = any(kind == b"IEND" for kind, _ in _png_chunks(data))
     try:
         values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:

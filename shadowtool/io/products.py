@@ -26,7 +26,7 @@ from shadowtool.core.warp_map import (
     to_st_map,
 )
 from shadowtool.errors import InputError
-from shadowtool.io.files import fingerprint, read_bytes, write_bytes
+from shadowtool.io.files import fingerprint, is_file, read_bytes, write_bytes
 from shadowtool.io.image import EXR, PNG, Header, Image, read_image, write_exr
 
 MANIFEST = "shadowtool.json"
@@ -66,10 +66,11 @@ def read_plates(folder: Path) -> StoredPlates:
         )
     frames = None
     confidence = folder / f"confidence{EXR}"
-    if confidence.is_file():
+    if is_file(confidence):
         image = read_image(confidence)
         images.append(image)
-        frames = np.nan_to_num(image.plane("frames")).astype(np.uint32)
+        counts = np.nan_to_num(image.channel("frames"), posinf=0, neginf=0)
+        frames = np.clip(counts, 0, 2**31).astype(np.uint32)
         if image.header.size != lit.header.size:
             raise InputError(f"{confidence}: is not of the plates' size")
     plates = Plates(lit.rgb().astype(np.float32), shadow.rgb().astype(np.float32), frames)
@@ -78,7 +79,7 @@ def read_plates(folder: Path) -> StoredPlates:
 
 def _plate(folder: Path, name: str) -> Path:
     for suffix in (EXR, PNG):
-        if (folder / f"{name}{suffix}").is_file():
+        if is_file(folder / f"{name}{suffix}"):
             return folder / f"{name}{suffix}"
     raise InputError(f"{folder}: has no {name}{EXR}; make the plates with `shadowtool plate`")
 
@@ -126,12 +127,12 @@ def read_scan(folder: Path) -> tuple[Pass, Header, str]:
     Raises:
         InputError: a file is missing, or does not hold what it should.
     """
-    if not (folder / SCAN).is_file():
+    if not is_file(folder / SCAN):
         raise InputError(f"{folder}: has no {SCAN}; make it with `shadowtool scan`")
     image = read_image(folder / SCAN)
     data = read_bytes(folder / LINES)
     lines = _parse_lines(folder / LINES, data, image)
-    time, contrast = image.plane("time"), np.maximum(image.plane("contrast"), 0)
+    time, contrast = image.channel("time"), np.maximum(image.channel("contrast"), 0)
     time = np.where(np.isfinite(time), time, np.float32(np.nan))
     contrast = np.where(np.isfinite(contrast), contrast, np.float32(0))
     scan = Pass(ShadowTimes(time, contrast), lines)
@@ -147,25 +148,34 @@ def _parse_lines(path: Path, data: bytes, image: Image) -> ShadowLines:
             normal=np.array([row["normal"] for row in rows], np.float64),
             offset=np.array([row["offset"] for row in rows], np.float64),
             residual=np.array([row["residual"] for row in rows], np.float64),
-            points=np.array([row.get("points", 0) for row in rows], np.int64),
+            points=np.array([_count(row.get("points", 0)) for row in rows], np.int64),
             origin=tuple(str(row.get("origin", "fit")) for row in rows),  # type: ignore[misc]
         )
         size = (int(record["width"]), int(record["height"]))
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         raise InputError(f"{path}: holds no shadow lines; run `shadowtool scan` again") from None
-    if len(lines) < 2 or lines.normal.shape != (len(lines), 2):
+    count = len(lines)
+    columns = (lines.frame, lines.offset, lines.residual)
+    if count < 2 or lines.normal.shape != (count, 2) or any(c.shape != (count,) for c in columns):
         raise InputError(f"{path}: holds no shadow lines; run `shadowtool scan` again")
-    columns = (lines.frame, lines.normal, lines.offset, lines.residual)
-    unit = np.abs(np.hypot(*lines.normal.T) - 1) < 1e-3
+    # Beyond this a number is no position in a picture, and squares of it would overflow.
+    sane = all((np.abs(column) < 1e9).all() for column in (*columns, lines.normal))
     if (
-        not all(np.isfinite(column).all() for column in columns)
-        or not unit.all()
+        not sane
+        or not (np.abs(np.hypot(*lines.normal.T) - 1) < 1e-3).all()
         or not (np.diff(lines.frame) > 0).all()
+        or (lines.residual < 0).any()
     ):
         raise InputError(f"{path}: its lines are no lines; run `shadowtool scan` again")
     if size != image.header.size:
         raise InputError(f"{path}: is for {size[0]}x{size[1]}, {SCAN} is {_size(image.header)}")
     return lines
+
+
+def _count(value: Any) -> int:
+    if not isinstance(value, int) or not 0 <= value < 2**53:
+        raise ValueError
+    return value
 
 
 def write_warp(path: Path, warp_map: WarpMap, header: Header, provenance: Provenance) -> None:
@@ -184,7 +194,7 @@ def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
         InputError: it has no R and G.
     """
     image = read_image(path)
-    st_map = np.stack([image.plane("R"), image.plane("G")], axis=-1)
+    st_map = np.stack([image.channel("R"), image.channel("G")], axis=-1)
     height, width = st_map.shape[:2]
     layer = image.layers.get("RGBA")
     error = (
@@ -207,7 +217,7 @@ def read_record(path: Path) -> dict[str, Any]:
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
     """Write a record so that the same content gives the same bytes."""
     text = json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
-    write_bytes(path, text.encode() + b"\n")
+    write_bytes(path, text.encode("utf-8", "replace") + b"\n")
 
 
 @contextlib.contextmanager

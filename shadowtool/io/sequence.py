@@ -63,6 +63,9 @@ class Sequence:
         """Frames that are missing between the first and the last.
 
         A constant step of two or more over three frames or more is taken as meant so.
+
+        Raises:
+            InputError: a number is so far off that it must belong to something else.
         """
         numbers = [frame for frame in self.files if isinstance(frame, int)]
         if len(numbers) != len(self.files) or len(numbers) < 2:
@@ -73,6 +76,12 @@ class Sequence:
         step = min(steps) if len(numbers) > 2 else 1
         if any(s % step for s in steps):
             step = 1
+        for before, after in itertools.pairwise(numbers):
+            if after - before > _WIDEST:
+                raise InputError(
+                    f"{self.pattern}: missing frames {before + 1}-{after - 1}; put the stray frame"
+                    " elsewhere"
+                )
         present = set(numbers)
         return tuple(f for f in range(numbers[0], numbers[-1], step) if f not in present)
 
@@ -115,6 +124,8 @@ def open_sequence(source: str | Path, role: str = "frames") -> Sequence:
         InputError: nothing there, nothing that can be read, or more than one sequence.
     """
     text = os.fspath(source)
+    if not text:
+        raise InputError(f"no file or folder is named for the {role}")
     path = Path(text)
     try:
         if path.is_dir():
@@ -140,7 +151,9 @@ def parse_frames(text: str) -> list[Frame]:
         OptionError: it can't be read.
     """
     try:
-        frames = _frames(FrameSet(text.strip().replace(":", "x")))
+        parts = [part.strip() for part in text.replace(":", "x").split(",")]
+        whole = not any(re.search(r"\s", part) for part in parts)
+        frames = _frames(FrameSet(",".join(parts))) if whole else []
     except (FileSeqException, ValueError, TypeError):
         frames = []
     if not frames:
@@ -187,13 +200,17 @@ def _sequences(folder: Path) -> list[_Found]:
     names = sorted(
         entry.name
         for entry in os.scandir(folder)
-        if not entry.name.startswith(".") and Path(entry.name).suffix.lower() in (EXR, PNG)
+        if not entry.name.startswith(".")
+        and Path(entry.name).suffix.lower() in (EXR, PNG)
+        and entry.is_file()
     )
     try:
         found = findSequencesInList(names)
-        if len(found) > 1 and all(s.frameSet() for s in found):
+        numbered = [s for s in found if s.frameSet()]
+        if len(numbered) > 1:
             # 1001.00, 1001.50, 1002.00 look like a sequence for each whole number.
-            fractional = findSequencesInList(names, allow_subframes=True)
+            members = [name for s in numbered for name in s]
+            fractional = findSequencesInList(members, allow_subframes=True)
             if len(fractional) == 1 and _fractions(_frames(fractional[0].frameSet() or ())):
                 found = fractional
         return [_from_fileseq(folder, s) for s in sorted(found, key=str)]
@@ -204,7 +221,7 @@ def _sequences(folder: Path) -> list[_Found]:
 def _fractions(frames: list[Frame]) -> bool:
     """Whether the digits after the point are parts of a frame, not takes' own frame numbers."""
     parts = {frame % 1 for frame in frames}
-    return len(parts) <= len({frame // 1 for frame in frames})
+    return max(len(str(part).partition(".")[2]) for part in parts) <= 3
 
 
 def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
@@ -214,11 +231,6 @@ def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
         path = folder / str(sequence)
         return _Found(_single(path), base, suffix, numbered=False)
     frames = sorted(_frames(frame_set))
-    if frames[-1] - frames[0] > _WIDEST:
-        raise InputError(
-            f"{folder / base}*{suffix}: numbers from {frames[0]} to {frames[-1]} are no sequence;"
-            " put the stray frame elsewhere"
-        )
     files = {frame: folder / sequence.frame(frame) for frame in frames}
     padding = "#" * max(sequence.zfill(), 1)
     name = base.rstrip("._- ") or folder.resolve().name
@@ -229,7 +241,7 @@ def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
 def _single(path: Path) -> Sequence:
     if path.suffix.lower() not in (EXR, PNG):
         raise InputError(f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on it first")
-    number = re.fullmatch(r"(?:(.*?)[._-]?)?(\d+)", path.stem)
+    number = re.fullmatch(r"(.*)[._](-?\d+)", path.stem) or re.fullmatch(r"(.*?)-?(\d+)", path.stem)
     if number is None:
         return Sequence(path.stem, os.fspath(path), {1: path})
     name = number[1] or path.resolve().parent.name
@@ -268,4 +280,5 @@ def _frames(frame_set: Iterable[int | float | Decimal]) -> list[Frame]:
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= 200 else f"{text[:100]}…{text[-60:]}"
+    line = "".join(c if c.isprintable() else "?" for c in text)
+    return line if len(line) <= 200 else f"{line[:100]}…{line[-60:]}"

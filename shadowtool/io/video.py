@@ -1,6 +1,7 @@
 """Movies and cameras, decoded at the depth that they were stored with."""
 
 import logging
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -65,19 +66,6 @@ class MovieFrame:
     coded: Float32
 
 
-def is_movie(path: Path) -> bool:
-    """Whether the file opens as a movie; a still picture does not count."""
-    try:
-        with av.open(str(path)) as container:
-            return bool(container.streams.video) and container.format.name not in (
-                "image2",
-                "png_pipe",
-                "exr_pipe",
-            )
-    except (FFmpegError, OSError, ValueError):
-        return False
-
-
 class Movie:
     """A movie file, read from its beginning, once.
 
@@ -92,8 +80,15 @@ class Movie:
             self._stream = self._container.streams.video[0]
         except (FFmpegError, OSError, ValueError, IndexError):
             raise InputError(f"{path}: no movie that can be decoded") from None
+        kind = self._container.format.name
+        # FFmpeg shows any text as a movie of a terminal.
+        if kind in ("image2", "tty") or kind.endswith("_pipe"):
+            raise InputError(f"{path}: a still picture or text, no movie")
         self._stream.thread_type = "AUTO"
         self.info = self._describe()
+
+    def close(self) -> None:
+        self._container.close()
 
     def frames(self) -> Iterator[MovieFrame]:
         """All frames in order.
@@ -140,8 +135,6 @@ class Movie:
         if not self._rgb and int(context.color_range) == 0 and not self._full:
             assumed.append("the movie names no range: video range (16-235) is assumed")
         bits = max(component.bits for component in pixel_format.components)
-        # FFmpeg widens samples to 16 bits by a shift, so that full white is not all ones.
-        self._white = np.float32(((1 << bits) - 1) << (16 - bits)) if bits <= 16 else 65535
         rate = self._stream.average_rate or self._stream.guessed_rate
         return MovieInfo(
             width=context.width,
@@ -155,32 +148,92 @@ class Movie:
         )
 
     def _coded(self, frame: av.VideoFrame) -> Float32:
-        # FFmpeg's own conversion to RGB is off by up to half a per cent; it only unpacks the
-        # planes here and brings chroma to full size, and the matrix is applied below.
-        if self._rgb:
-            packed = frame.reformat(format="gbrp16le").to_ndarray()
-            return packed.astype(np.float32) / self._white
+        # FFmpeg's own conversion to RGB is off by up to half a per cent, and its change of depth
+        # by a code value; planes are taken as they are stored and the matrix is applied here.
+        planes, white = _planes(frame)
         if self._gray:
-            gray = frame.reformat(format="gray16le").to_ndarray().astype(np.float32)
-            return np.repeat(self._luma(gray)[..., None], 3, axis=-1)
-        planes = frame.reformat(format="yuv444p16le").to_ndarray(channel_last=True)
-        code = planes.astype(np.float32)
-        luma = self._luma(code[..., 0])
-        blue_difference, red_difference = (self._chroma(code[..., i]) for i in (1, 2))
+            return np.repeat(self._luma(planes[0], white)[..., None], 3, axis=-1)
+        if self._rgb:
+            green, blue, red = (plane / white for plane in planes)
+            return np.stack([red, green, blue], axis=-1)
+        luma = self._luma(planes[0], white)
+        height, width = luma.shape
+        blue_difference, red_difference = (
+            self._chroma(_full_size(plane, width, height), white) for plane in planes[1:]
+        )
         kr, kb = self._weights
         red = luma + np.float32(2 * (1 - kr)) * red_difference
         blue = luma + np.float32(2 * (1 - kb)) * blue_difference
         green = (luma - np.float32(kr) * red - np.float32(kb) * blue) / np.float32(1 - kr - kb)
         return np.stack([red, green, blue], axis=-1)
 
-    def _luma(self, code: Float32) -> Float32:
+    def _luma(self, code: Float32, white: np.float32) -> Float32:
         if self._full:
-            return code / self._white
-        return (code - np.float32(16 * 256)) / np.float32(219 * 256)
+            return code / white
+        step = (white + 1) / 256
+        return (code - 16 * step) / (219 * step)
 
-    def _chroma(self, code: Float32) -> Float32:
-        scale = self._white if self._full else np.float32(224 * 256)
-        return (code - np.float32(128 * 256)) / scale
+    def _chroma(self, code: Float32, white: np.float32) -> Float32:
+        step = (white + 1) / 256
+        return (code - 128 * step) / (white if self._full else 224 * step)
+
+
+_PLANAR = re.compile(r"(?:yuvj?(?:420|422|440|444)|gbr|gray)p?(?:9|1[0246])?(?:le)?")
+
+
+def _planes(frame: av.VideoFrame) -> tuple[list[Float32], np.float32]:
+    """A frame's planes as stored, and the code of full white.
+
+    Formats that aren't planar, big-endian or carry alpha are unpacked to the nearest that is.
+    """
+    if not _PLANAR.fullmatch(frame.format.name):
+        bits = max(component.bits for component in frame.format.components)
+        depth = "" if bits <= 8 else "10le" if bits <= 10 else "12le" if bits <= 12 else "16le"
+        if len(frame.format.components) < 3:
+            name = f"gray{depth}"
+        elif frame.format.is_rgb:
+            name = f"gbrp{depth}"
+        else:
+            name = f"yuv{_subsampling(frame)}p{depth}"
+        frame = frame.reformat(format=name)
+    component = frame.format.components[0]
+    kind = np.dtype(np.uint8 if component.bits <= 8 else "<u2")
+    planes = []
+    for plane in frame.planes:
+        rows = np.frombuffer(
+            memoryview(plane), kind, plane.height * plane.line_size // kind.itemsize
+        )
+        whole = rows.reshape(plane.height, plane.line_size // kind.itemsize)
+        planes.append(whole[:, : plane.width].astype(np.float32))
+    return planes, np.float32((1 << component.bits) - 1)
+
+
+def _subsampling(frame: av.VideoFrame) -> str:
+    across = frame.format.chroma_width(64)
+    down = frame.format.chroma_height(64)
+    return {(64, 64): "444", (32, 64): "422", (64, 32): "440"}.get((across, down), "420")
+
+
+def _full_size(chroma: Float32, width: int, height: int) -> Float32:
+    """Chroma at luma's size: its samples lie on every second column, and between rows."""
+    if chroma.shape[1] != width:
+        wide = np.repeat(chroma, 2, axis=1)
+        wide[:, 1:-1:2] = (chroma[:, :-1] + chroma[:, 1:]) / 2
+        chroma = wide[:, :width]
+    if chroma.shape[0] != height:
+        double = (chroma.shape[1], 2 * chroma.shape[0])
+        tall = cv2.resize(np.ascontiguousarray(chroma), double, interpolation=cv2.INTER_LINEAR)
+        chroma = np.asarray(tall, np.float32)[:height]
+    return chroma
+
+
+def is_movie(path: Path) -> bool:
+    """Whether the file opens as a movie; still pictures and text do not count."""
+    try:
+        Movie(path).close()
+    except InputError:
+        return False
+    return True
 
 
 def camera_frames(device: int, seconds: float) -> Iterator[MovieFrame]:

@@ -117,6 +117,8 @@ def capture(
     name = output.resolve().name
     taking = _Taking(opened, recipe, output, name, suffix, transfer, crop, size, run)
     mark = recipe.fingerprint([opened.fingerprint])
+    if opened.folder is not None and output.resolve() == opened.folder.resolve():
+        raise OptionError(f"{output}: is the folder of the frames to capture; give another -o")
     if run.resume and (kept := taking.kept(mark)) is not None:
         return kept
     if opened.wanted is not None:
@@ -131,12 +133,20 @@ def capture(
         raise InputError(
             f"{opened.name}: has no frames {frame_range(absent)}; its last is {frames[-1]}"
         )
+    if opened.wanted is None and len(frames) + len(skipped) < opened.total:
+        logger.warning(
+            "%s: says that it has %d frames, but %d are in it; it may be cut off",
+            opened.name,
+            opened.total,
+            len(frames),
+        )
     record = _record(opened, report, frames, transfer, size)
     write_json(output / RECORD, record)
-    figures = {key: record[key] for key in _FIGURES}
-    taking.finish(mark, report.marks, figures)
+    taking.finish(mark, report.marks)
     _warn(record, strict, output)
-    return Result("capture", output, frames, 0, [*opened.absent, *skipped, *absent], figures)
+    return Result(
+        "capture", output, frames, 0, [*opened.absent, *skipped, *absent], _figures(record)
+    )
 
 
 class _Measured(NamedTuple):
@@ -247,6 +257,8 @@ class _Taking:
             else:
                 skipped.append(done)
             self.run.progress(number, max(total, number) if total else 0)
+        if frames:
+            self.run.progress(len(frames), len(frames))
         return frames, skipped, report
 
     def _write(self, arriving: Arriving, reference: Float32 | None) -> _Measured:
@@ -281,33 +293,35 @@ class _Taking:
     def kept(self, mark: str) -> Result | None:
         """The result of an earlier run of the same, if all that it wrote is there and whole."""
         manifest = read_record(self.output / MANIFEST)
-        rows, figures = manifest.get("frames"), manifest.get("figures")
-        if manifest.get("fingerprint") != mark or not isinstance(rows, dict) or figures is None:
+        rows, record = manifest.get("frames"), read_record(self.output / RECORD)
+        if manifest.get("fingerprint") != mark or not isinstance(rows, dict) or not record:
             return None
         wanted = self.source.wanted
         numbers = [str(frame) for frame in wanted] if wanted is not None else list(rows)
-        marks = {number: rows.get(number, {}).get("fingerprint") for number in numbers}
         try:
             frames: list[Frame] = list(wanted) if wanted is not None else [int(n) for n in numbers]
         except ValueError:
             return None
-        whole = read_record(self.output / RECORD) and all(
-            current([self.place(frame)], str(marks[str(frame)])) is not None for frame in frames
-        )
-        if not whole:
-            return None
+        for frame in frames:
+            mark = str(rows.get(str(frame), {}).get("fingerprint"))
+            if self.source.marks:
+                mark = self.recipe.fingerprint([self.source.marks[frame]])
+            if current([self.place(frame)], mark) is None:
+                return None
         # Written anew, so that make sees that the step has been looked after.
         write_json(self.output / MANIFEST, manifest)
-        return Result("capture", self.output, frames, len(frames), self.source.absent, figures)
+        return Result(
+            "capture", self.output, frames, len(frames), self.source.absent, _figures(record)
+        )
 
-    def finish(self, mark: str, marks: dict[str, str], figures: Figures) -> None:
+    def finish(self, mark: str, marks: dict[str, str]) -> None:
         """Write the manifest, together with what other chunks of the same wrote."""
         rows: dict[str, Any] = {frame: {"fingerprint": own} for frame, own in marks.items()}
         with folder_lock(self.output):
             before = read_record(self.output / MANIFEST)
             if before.get("fingerprint") == mark and isinstance(before.get("frames"), dict):
                 rows = {**before["frames"], **rows}
-            write_manifest(self.output, self.recipe, mark, figures, rows)
+            write_manifest(self.output, self.recipe, mark, {}, rows)
 
 
 def _size(header: Header, crop: Crop | None, scale: float) -> tuple[int, int]:
@@ -351,6 +365,10 @@ def _record(
             "unmeasured": len(report.shifts) - len(measured),
         },
     }
+
+
+def _figures(record: dict[str, Any]) -> Figures:
+    return {key: record.get(key) for key in _FIGURES}
 
 
 def _warn(record: dict[str, Any], strict: bool, output: Path) -> None:

@@ -53,7 +53,7 @@ class Source:
 
     Attributes:
         name: as a person would say it.
-        fingerprint: of the whole source.
+        fingerprint: of a source that is one file; empty for a sequence.
         header: the first frame's.
         transfer: the transfer function that was found or assumed.
         assumed: sentences about what the source left open.
@@ -62,6 +62,8 @@ class Source:
         total: how many frames there will be, 0 if unknown.
         arriving: the frames, in order; to be gone through once.
         absent: frames that are known to be missing.
+        folder: where a sequence's files are.
+        marks: fingerprint of each wanted frame, where they can be told apart; else empty.
     """
 
     name: str
@@ -74,6 +76,8 @@ class Source:
     total: int
     arriving: Iterator[Arriving]
     absent: list[Frame] = field(default_factory=list)
+    folder: Path | None = None
+    marks: dict[Frame, str] = field(default_factory=dict)
 
 
 def open_source(
@@ -170,7 +174,7 @@ def _sequence(
         bits = 8 * stored.dtype.itemsize
     return Source(
         name=Path(footage.sequence.pattern).name,
-        fingerprint=" ".join(marks.values()),
+        fingerprint="",
         header=footage.header,
         transfer=footage.transfer,
         assumed=[f"{'PNG' if png else 'EXR'} frames are taken as {footage.transfer}"],
@@ -179,6 +183,8 @@ def _sequence(
         total=len(present),
         arriving=arriving(),
         absent=[frame + offset for frame in absent],
+        folder=Path(footage.sequence.pattern).parent,
+        marks={frame + offset: mark for frame, mark in marks.items()},
     )
 
 

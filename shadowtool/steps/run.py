@@ -10,7 +10,7 @@ from typing import Any
 from shadowtool import __version__
 from shadowtool.choices import Missing
 from shadowtool.errors import DamagedFileError, InputError, OutputExistsError
-from shadowtool.io.files import fingerprint_file, make_folder
+from shadowtool.io.files import fingerprint_file, is_file, new_folders
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame
@@ -105,7 +105,7 @@ def refuse_existing(files: Iterable[Path], run: Run) -> None:
     """
     if run.overwrite or run.resume:
         return
-    there = [file for file in files if file.exists()]
+    there = [file for file in files if is_file(file)]
     if there:
         more = f" and {len(there) - 1} more" if len(there) > 1 else ""
         raise OutputExistsError(
@@ -147,20 +147,21 @@ class FrameWork:
             summary: from the figures of all the frames that the manifest knows.
         """
         refuse_existing((file for frame in frames for file in self.products(frame)), run)
-        for folder in {file.parent for frame in frames for file in self.products(frame)}:
-            make_folder(folder)
-        make_folder(self.output)
-        run.progress(0, len(frames))
+        folders = {file.parent for frame in frames for file in self.products(frame)}
         rows: dict[str, Figures] = {}
         skipped, kept = list(absent), 0
-        results = ordered_map(lambda frame: self._frame(frame, run), frames, run.jobs)
-        for number, (frame, outcome) in enumerate(zip(frames, results, strict=True), start=1):
-            if outcome is None:
-                skipped.append(frame)
-            else:
-                rows[str(frame)] = outcome[0]
-                kept += outcome[1]
-            run.progress(number, len(frames))
+        with new_folders([self.output, *sorted(folders)]):
+            run.progress(0, len(frames))
+            results = ordered_map(lambda frame: self._frame(frame, run), frames, run.jobs)
+            for number, (frame, outcome) in enumerate(zip(frames, results, strict=True), start=1):
+                if outcome is None:
+                    skipped.append(frame)
+                else:
+                    rows[str(frame)] = outcome[0]
+                    kept += outcome[1]
+                run.progress(number, len(frames))
+            if not rows:
+                raise InputError(f"{self.output}: no frame could be made; all are skipped")
         figures = self._record(rows, summary)
         done = [frame for frame in frames if str(frame) in rows]
         return Result(self.recipe.step, self.output, done, kept, skipped, figures)
@@ -200,7 +201,7 @@ def current(files: list[Path], mark: str) -> Figures | None:
     """The figures of products that are whole and made of the same; None if they aren't."""
     figures: Figures = {}
     for file in files:
-        if not file.is_file():
+        if not is_file(file):
             return None
         try:
             provenance = read_image(file).header.provenance

@@ -2,6 +2,7 @@
 
 import logging
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,10 @@ from shadowtool.core.warp_map import (
     resample,
 )
 from shadowtool.errors import OptionError, ReshootError
-from shadowtool.io.files import make_folder
+from shadowtool.io.files import is_file, make_folder
 from shadowtool.io.image import EXR, Header, read_header, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import MANIFEST, WARP, read_scan, read_warp, write_warp
-from shadowtool.io.sequence import Frame, frame_file, open_sequence
+from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_size
 from shadowtool.steps.run import (
     Figures,
@@ -39,21 +40,57 @@ logger = logging.getLogger(__name__)
 PICTURE = "warp.png"
 
 
-def solve_warp(
-    scans: list[Path], output: Path, *, run: Run = Run(), iterations: int = 40
-) -> Result:
-    """Write ``warp.exr`` and a picture of it.
+def warp(
+    scans: list[Path],
+    output: Path,
+    *,
+    run: Run = Run(),
+    map_file: Path | None = None,
+    apply_to: str | Path | None = None,
+    outside: float = 1.0,
+    iterations: int = 40,
+) -> list[Result]:
+    """Solve a map from scans, or take one that is there, and see frames through it.
+
+    Solving writes ``warp.exr`` and a picture of it. Applying writes frames under
+    ``NAME/NAME.1001.exr``, NAME the input's: every channel resampled bilinearly as it is stored, at
+    the map's size.
 
     Args:
-        scans: two or more folders of `scan`.
+        scans: two or more folders of `scan`; none with ``map_file``.
+        map_file: an ST map.
+        apply_to: frames to warp.
+        outside: the value where the map points outside the frame; 1 is lit.
         iterations: of the diffusion; 0 only fills.
 
+    Returns:
+        The results of solving and applying, as far as each was done.
+
     Raises:
-        InputError: a scan is missing, or sizes differ.
+        InputError: scans, map or frames are missing or don't fit.
+        OptionError: neither or both of scans and map, or nothing to do.
         ReshootError: the passes can't fix any point.
     """
-    if len(scans) < 2:
+    if bool(scans) == (map_file is not None):
+        raise OptionError("give two or more SCAN folders, or --map FILE")
+    if map_file is not None and apply_to is None:
+        raise OptionError("--map FILE needs --apply FRAMES")
+    if map_file is None and len(scans) < 2:
         raise OptionError("a map takes two scans or more, swept at different angles")
+    applied = None if apply_to is None else _open_frames(apply_to, output, run)
+    if map_file is not None:
+        assert applied is not None
+        # A folder in which a map was solved keeps the record of that.
+        record_in = applied.folder if is_file(output / WARP) else output
+        return [_apply(map_file, applied, record_in, run, outside)]
+    results = [_solve(scans, output, run, iterations)]
+    if applied is not None:
+        folder = output / applied.sequence.name
+        results.append(_apply(output / WARP, applied, folder, run, outside))
+    return results
+
+
+def _solve(scans: list[Path], output: Path, run: Run, iterations: int) -> Result:
     read = [read_scan(folder) for folder in scans]
     header = read[0][1]
     for folder, (_, other, _) in zip(scans, read, strict=True):
@@ -93,45 +130,44 @@ def solve_warp(
     return Result("warp", output, [], 0, (), figures)
 
 
-def apply_warp(
-    map_file: Path,
-    source: str | Path,
-    output: Path,
-    *,
-    run: Run = Run(),
-    outside: float = 1.0,
-    record_in: Path | None = None,
-) -> Result:
-    """Write frames as the map sees them, under ``NAME/NAME.1001.exr``; NAME is the input's.
+@dataclass(frozen=True)
+class _Frames:
+    """Frames to warp, and where they go."""
 
-    Every channel is resampled bilinearly; the map's size is the result's. Colour is resampled as
-    stored, so encoded footage should be captured to linear light first.
+    sequence: Sequence
+    present: list[Frame]
+    absent: list[Frame]
+    folder: Path
 
-    Args:
-        outside: the value where the map points outside the frame; 1 is lit.
-        record_in: the folder of the manifest, by default that of the frames.
+    def place(self, frame: Frame) -> Path:
+        return self.folder / frame_file(self.sequence.name, frame, EXR)
 
-    Raises:
-        InputError: map or frames are missing.
-    """
-    warp_map, header, map_mark = read_warp(map_file)
-    frames_in = open_sequence(source, "frames to warp")
-    frames, absent = frames_in.select(run.frames, run.missing)
+
+def _open_frames(source: str | Path, output: Path, run: Run) -> _Frames:
+    sequence = open_sequence(source, "frames to warp")
+    present, absent = sequence.select(run.frames, run.missing)
     if run.missing == "error":
-        for frame in frames:
-            read_header(frames_in.path(frame))
-    folder = output / frames_in.name
+        for frame in present:
+            read_header(sequence.path(frame))
+    frames = _Frames(sequence, present, absent, output / sequence.name)
+    refuse_existing(map(frames.place, present), run)
+    return frames
+
+
+def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: float) -> Result:
+    warp_map, header, map_mark = read_warp(map_file)
+    sequence = frames.sequence
     recipe = Recipe(
         "warp",
         {"outside": outside},
-        {"map": map_file.name, "frames": Path(frames_in.pattern).name},
+        {"map": map_file.name, "frames": Path(sequence.pattern).name},
     )
 
     def products(frame: Frame) -> list[Path]:
-        return [folder / frame_file(frames_in.name, frame, EXR)]
+        return [frames.place(frame)]
 
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
-        image = read_image(frames_in.path(frame))
+        image = read_image(sequence.path(frame))
         scaled = _scaled(warp_map, header, image.header)
         layers = {}
         for name, values in image.layers.items():
@@ -143,15 +179,11 @@ def apply_warp(
         write_exr(products(frame)[0], layers, image.header, provenance)
         return {}
 
-    work = FrameWork(
-        recipe,
-        record_in or folder,
-        products,
-        lambda frame: [frames_in.path(frame)],
-        [map_mark],
-        make,
-    )
-    return work.run(frames, run, absent)
+    def sources(frame: Frame) -> list[Path]:
+        return [sequence.path(frame)]
+
+    work = FrameWork(recipe, record_in, products, sources, [map_mark], make)
+    return work.run(frames.present, run, frames.absent)
 
 
 def _scaled(warp_map: WarpMap, header: Header, source: Header) -> np.ndarray:

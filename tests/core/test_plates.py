@@ -120,5 +120,14 @@ def test_misuse_is_refused() -> None:
     extremes.add(np.zeros((2, 2, 3), np.float16))
     with pytest.raises(ValueError):
         extremes.add(np.zeros((2, 3, 3), np.float16))
-    with pytest.raises(ValueError):
-        extremes.add(np.zeros((2, 2, 3), np.float32))
+
+
+def test_halfs_and_floats_may_be_mixed() -> None:
+    extremes = ExtremePlates()
+    holdout = np.array([[1, 0]])
+    extremes.add(np.full((1, 2, 3), 0.25, np.float16), holdout)
+    extremes.add(np.full((1, 2, 3), 0.1, np.float32), holdout)
+    extremes.add(np.full((1, 2, 3), 0.5, np.float16))
+    plates = extremes.plates()
+    assert plates.lit[0, :, 0].tolist() == [0.5, 0.5]
+    assert plates.shadow[0, :, 0] == pytest.approx([0.5, 0.1])

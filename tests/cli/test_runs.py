@@ -1,0 +1,472 @@
+"""Every command on a tiny shot: the same bytes however it is run, and nothing lost on a rerun."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from shadowtool.cli.options import PROGRESS
+
+COMMANDS = ("capture", "plate", "matte", "scan", "warp", "apply", "composite")
+PER_FRAME = ("capture", "matte", "apply", "composite")
+# A product of each per-frame command that belongs to frame 1003.
+PRODUCT = {
+    "capture": "out.1003.exr",
+    "matte": "beta/beta.1003.exr",
+    "apply": "beta/beta.1003.exr",
+    "composite": "out.1003.exr",
+}
+# What each command reads for frame 1003, as a folder of the shot and the option that names it.
+FRAMES_READ = {
+    "capture": ("source", 1),
+    "matte": ("source", 1),
+    "apply": ("matte/beta", 4),
+    "composite": ("matte", 1),
+}
+CHANGED_OPTION = {
+    "matte": ("--fill", "lit"),
+    "plate": ("--transfer", "none"),
+    "scan": ("--transfer", "rec709"),
+    "warp": ("--iterations", "3"),
+    "apply": ("--outside", "0.5"),
+    "composite": ("--fill", "inpaint"),
+    "capture": ("--crop", "40x30+1+1"),
+}
+
+
+@pytest.fixture
+def make(shot, command, tmp_path) -> Callable:
+    """Run a command of the table into ``tmp_path/PLACE/out``; its outcome must be the code."""
+
+    def call(name: str, place: str, *options: object, code: int = 0, words=None) -> Path:
+        output = tmp_path / place / "out"
+        outcome = command(*(words or shot.arguments(name)), "-o", output, *options)
+        assert outcome.code == code, outcome.err
+        return output
+
+    return call
+
+
+def write_movie(path: Path) -> Path:
+    rng = np.random.default_rng(3)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "bgr0"
+        for _ in range(5):
+            picture = rng.integers(0, 256, (32, 48, 3)).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="bgr0")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.fixture
+def movie(tmp_path: Path) -> Path:
+    return write_movie(tmp_path / "take.mkv")
+
+
+def replaced(words: list[str], position: int, value: object) -> list[str]:
+    return [*words[:position], str(value), *words[position + 1 :]]
+
+
+def times(folder: Path) -> dict[str, int]:
+    return {str(p): p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file()}
+
+
+def age(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        os.utime(path, (1e9, 1e9))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_two_threads_write_the_same_bytes_as_one(name, make, tree):
+    one, two = make(name, "one", "-j1"), make(name, "two", "-j2")
+    assert tree(one) == tree(two)
+    assert "shadowtool.json" in tree(one)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_two_runs_write_the_same_bytes(name, make, tree):
+    assert tree(make(name, "first")) == tree(make(name, "second"))
+
+
+@pytest.mark.parametrize("name", ["matte", "apply", "composite"])
+@pytest.mark.parametrize("chunks", [("1001-1003", "1004-1006"), ("1002-1006x2", "1001-1006x2")])
+def test_chunks_written_into_one_folder_equal_the_whole(name, chunks, make, tree):
+    whole = make(name, "whole")
+    for chunk in chunks:
+        parts = make(name, "parts", "--frames", chunk)
+    assert tree(parts) == tree(whole)
+
+
+def test_chunks_of_a_capture_are_the_same_frames_and_one_record(make, tree):
+    whole = make("capture", "whole")
+    for chunk in ("1001-1003", "1004-1006"):
+        parts = make("capture", "parts", "--frames", chunk)
+    frames = {path: data for path, data in tree(whole).items() if path.endswith(".exr")}
+    assert {path: data for path, data in tree(parts).items() if path.endswith(".exr")} == frames
+    assert tree(parts)["shadowtool.json"] == tree(whole)["shadowtool.json"]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_second_run_is_refused_and_changes_nothing(name, make, command, shot, tree):
+    output = make(name, "once")
+    before, stamps = tree(output), times(output)
+    outcome = command(*shot.arguments(name), "-o", output)
+    assert outcome.code == 1
+    assert outcome.err.startswith("shadowtool: error: ")
+    assert "--overwrite" in outcome.err
+    assert (tree(output), times(output)) == (before, stamps)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_overwrite_replaces_what_is_there(name, make, tree):
+    output = make(name, "once")
+    before = tree(output)
+    for path in before:
+        (output / path).write_bytes(b"spoiled")
+    make(name, "once", "--overwrite")
+    assert tree(output) == before
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_resume_writes_no_product_again_that_is_current(name, make, tree):
+    output = make(name, "once")
+    before = tree(output)
+    age(output)
+    make(name, "once", "--resume")
+    assert tree(output) == before
+    fresh = {p for p, t in times(output).items() if t > 1e18 + 1}
+    assert {Path(p).name for p in fresh} <= {"shadowtool.json"}
+
+
+@pytest.mark.parametrize("name", PER_FRAME)
+def test_resume_makes_a_deleted_frame_again_and_leaves_the_others_alone(name, make, tree):
+    output = make(name, "once")
+    before = tree(output)
+    age(output)
+    (output / PRODUCT[name]).unlink()
+    make(name, "once", "--resume")
+    assert tree(output) == before
+    fresh = {str(Path(p).relative_to(output)) for p, t in times(output).items() if t > 1e18 + 1}
+    assert {p for p in fresh if "1003" not in p} <= {"shadowtool.json", "capture.json"}
+
+
+@pytest.mark.parametrize("name", PER_FRAME)
+def test_resume_makes_a_truncated_frame_again(name, make, tree):
+    output = make(name, "once")
+    before = tree(output)
+    product = output / PRODUCT[name]
+    product.write_bytes(before[PRODUCT[name]][:-40])
+    make(name, "once", "--resume")
+    assert tree(output) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "product"),
+    [
+        ("plate", "lit.exr"),
+        ("plate", "confidence.exr"),
+        ("scan", "scan.exr"),
+        ("scan", "lines.json"),
+        ("warp", "warp.exr"),
+    ],
+)
+def test_resume_makes_a_truncated_product_again(name, product, make, tree):
+    output = make(name, "once")
+    before = tree(output)
+    (output / product).write_bytes(before[product][:-40])
+    make(name, "once", "--resume")
+    assert tree(output) == before
+
+
+@pytest.mark.parametrize(("name", "picture"), [("scan", "scan.png"), ("warp", "warp.png")])
+def test_resume_makes_a_lost_picture_again(name, picture, make, tree):
+    output = make(name, "once")
+    before = tree(output)
+    (output / picture).unlink()
+    make(name, "once", "--resume")
+    assert tree(output) == before
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_resume_after_the_manifest_was_lost_writes_it_again(name, make, tree):
+    output = make(name, "once")
+    before = tree(output)
+    (output / "shadowtool.json").unlink()
+    make(name, "once", "--resume")
+    assert tree(output) == before
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_resume_starts_anew_when_a_parameter_changed(name, make, tree):
+    wanted = make(name, "wanted", *CHANGED_OPTION[name])
+    output = make(name, "once")
+    assert tree(output) != tree(wanted)
+    make(name, "once", "--resume", *CHANGED_OPTION[name])
+    assert tree(output) == tree(wanted)
+
+
+@pytest.mark.parametrize("name", PER_FRAME)
+def test_resume_makes_a_frame_again_whose_input_changed(name, make, shot, copied, tree):
+    folder, position = FRAMES_READ[name]
+    copy = copied(folder)
+    words = replaced(shot.arguments(name), position, copy)
+    output = make(name, "once", words=words)
+    before = tree(output)
+    changed = next(p for p in sorted(copy.rglob("*.1003.exr")) if "fg" not in p.parts)
+    changed.write_bytes(changed.with_name(changed.name.replace("1003", "1005")).read_bytes())
+    make(name, "once", "--resume", words=words)
+    after = tree(output)
+    assert after[PRODUCT[name]] != before[PRODUCT[name]]
+    assert after == tree(make(name, "anew", words=words))
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "file", "position"),
+    [
+        ("plate", "photometric", "photometric.1004.exr", 1),
+        ("scan", "sweep1", "sweep1.1004.exr", 1),
+        ("warp", "scan1", "lines.json", 1),
+        ("matte", "plates", "lit.exr", 3),
+        ("composite", "plates", "lit.exr", 3),
+    ],
+)
+def test_resume_starts_anew_when_an_input_changed(
+    name, part, file, position, make, shot, copied, tree
+):
+    copy = copied(part)
+    words = replaced(shot.arguments(name), position, copy)
+    output = make(name, "once", words=words)
+    manifest = tree(output)["shadowtool.json"]
+    path = copy / file
+    if path.suffix == ".json":
+        record = json.loads(path.read_bytes())
+        record["lines"][3]["offset"] += 0.25
+        path.write_text(json.dumps(record))
+    elif name in ("matte", "composite"):
+        path.write_bytes((copy / "shadow.exr").read_bytes())
+    else:
+        path.write_bytes((copy / file.replace("1004", "1006")).read_bytes())
+    make(name, "once", "--resume", words=words)
+    assert tree(output)["shadowtool.json"] != manifest
+    assert tree(output) == tree(make(name, "anew", words=words))
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "position"),
+    [
+        ("capture", "source", 1),
+        ("plate", "photometric", 1),
+        ("matte", "source", 1),
+        ("scan", "sweep1", 1),
+        ("apply", "matte/beta", 4),
+        ("composite", "matte", 1),
+    ],
+)
+@pytest.mark.parametrize("fault", ["deleted", "truncated", "empty", "text"])
+def test_missing_skip_goes_on_without_a_bad_frame(
+    name, folder, position, fault, command, shot, copied, tmp_path
+):
+    copy = copied(folder)
+    for path in copy.rglob("*.1003.exr"):
+        data = path.read_bytes()
+        path.unlink()
+        if fault != "deleted":
+            kept = {"truncated": data[:-60], "empty": b"", "text": b"hello\n"}[fault]
+            path.write_bytes(kept)
+    words = replaced(shot.arguments(name), position, copy)
+    outcome = command(*words, "-o", tmp_path / "out", "--missing", "skip")
+    assert outcome.code == 3, outcome.err
+    assert "SKIPPED 1003" in outcome.out
+    assert (tmp_path / "out" / "shadowtool.json").is_file()
+    assert not [p for p in (tmp_path / "out").rglob("*") if "1003" in p.name]
+
+
+@pytest.mark.parametrize(("name", "option"), [("matte", "--alpha"), ("plate", "--holdout")])
+@pytest.mark.parametrize("fault", ["deleted", "empty"])
+def test_missing_skip_goes_on_without_a_bad_matte(
+    name, option, fault, command, shot, copied, tmp_path
+):
+    mattes = copied("matte") / "fg"
+    if name == "plate":
+        for number in range(1007, 1013):
+            (mattes / f"fg.{number}.exr").write_bytes((mattes / "fg.1001.exr").read_bytes())
+    bad = mattes / "fg.1003.exr"
+    bad.unlink()
+    if fault == "empty":
+        bad.write_bytes(b"")
+    words = [*shot.arguments(name), option, mattes, "-o", tmp_path / "out", "--missing", "skip"]
+    outcome = command(*words)
+    assert outcome.code == 3, outcome.err
+    assert "SKIPPED 1003" in outcome.out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_json_prints_one_valid_document(name, shot, command, tmp_path):
+    outcome = command(*shot.arguments(name), "-o", tmp_path / "out", "--json")
+    assert outcome.code == 0
+    record = json.loads(outcome.out)
+    assert record["step"] == ("warp" if name == "apply" else name)
+    assert record["skipped"] == ""
+
+
+def test_json_of_a_solved_and_applied_map_is_a_list_of_both(shot, command, tmp_path):
+    words = [*shot.arguments("warp"), "--apply", shot.matte / "beta", "-o", tmp_path / "out"]
+    outcome = command(*words, "--json")
+    assert [row["frames"] for row in json.loads(outcome.out)] == ["", "1001-1006"]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_quiet_prints_nothing(name, shot, command, tmp_path):
+    outcome = command(*shot.arguments(name), "-o", tmp_path / "out", "-q")
+    assert outcome == (0, "", "")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("kind", PROGRESS)
+def test_progress_never_goes_to_stdout(name, kind, shot, command, tmp_path):
+    outcome = command(*shot.arguments(name), "-o", tmp_path / "out", "--progress", kind, "--json")
+    assert outcome.code == 0
+    json.loads(outcome.out)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_openjd_progress_climbs_from_zero_to_a_hundred(name, shot, command, tmp_path):
+    outcome = command(*shot.arguments(name), "-o", tmp_path / "out", "--progress", "openjd")
+    lines = [line for line in outcome.err.splitlines() if line.startswith("openjd_progress: ")]
+    parts = [float(line.removeprefix("openjd_progress: ")) for line in lines]
+    assert parts[0] == 0.0
+    assert parts[-1] == 100.0
+    assert parts == sorted(parts)
+
+
+@pytest.mark.parametrize("kind", ["none", "plain"])
+def test_a_short_run_without_a_terminal_says_nothing_on_stderr(kind, shot, command, tmp_path):
+    words = [*shot.arguments("matte"), "-o", tmp_path / "out", "--progress", kind]
+    assert command(*words).err == ""
+
+
+def test_plain_progress_prints_a_line_every_few_seconds(shot, command, tmp_path, monkeypatch):
+    clock = iter(range(0, 1000, 4))
+    monkeypatch.setattr("shadowtool.cli.progress.time.monotonic", lambda: next(clock))
+    outcome = command(*shot.arguments("matte"), "-o", tmp_path / "out", "--progress", "plain")
+    lines = outcome.err.splitlines()
+    assert lines
+    assert all(line.startswith("matte: ") and line.endswith(" of 6") for line in lines)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("folder", ["with a space", "Schatten größer", "take[1]", "100% #1"])
+def test_output_folders_may_have_any_name(name, folder, make, tree):
+    plain, odd = make(name, "plain"), make(name, folder)
+    assert tree(odd) == tree(plain)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_working_directory_makes_no_difference(name, make, shot, tmp_path, tree, monkeypatch):
+    absolute = make(name, "absolute")
+    monkeypatch.chdir(shot.folder)
+    words = [
+        os.path.relpath(word) if word.startswith(str(shot.folder)) else word
+        for word in shot.arguments(name)
+    ]
+    relative = tmp_path / "relative" / "out"
+    make(name, os.path.relpath(relative.parent, tmp_path), words=words)
+    assert tree(relative) == tree(absolute)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_input_folders_may_be_named_in_no_encoding(name, shot, tmp_path):
+    odd = os.fsencode(tmp_path) + b"/sh\xe9t"
+    Path(os.fsdecode(odd)).symlink_to(shot.folder)
+    words = [word.replace(str(shot.folder), os.fsdecode(odd)) for word in shot.arguments(name)]
+    program = [sys.executable, "-c", "from shadowtool.cli import main; main()"]
+    done = subprocess.run(
+        [*program, *words, "-o", tmp_path / "out"], capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", ["matte", "capture"])
+def test_folders_and_frames_may_be_named_in_no_encoding(name, command, shot, tmp_path):
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/pl\xe2t"))
+    odd.symlink_to(shot.plates if name == "matte" else shot.source)
+    position = 3 if name == "matte" else 1
+    words = replaced(shot.arguments(name), position, odd)
+    if name == "capture":
+        words[1] = os.fsdecode(os.fsencode(tmp_path) + b"/t\xe9ke.mkv")
+        shutil.copy(write_movie(tmp_path / "take.mkv"), words[1])
+    assert command(*words, "-o", tmp_path / "out", "-q").code == 0
+
+
+def test_the_manifest_is_newer_than_every_product(make):
+    for name in COMMANDS:
+        stamps = times(make(name, name))
+        last = max(stamps, key=lambda path: stamps[path])
+        assert stamps[last] == next(t for p, t in stamps.items() if p.endswith("shadowtool.json"))
+
+
+def test_time_codes_stay_with_their_frames(make, shot, copied):
+    import OpenEXR
+
+    copy = copied("source")
+    for path in sorted(copy.glob("*.exr")):
+        number = int(path.stem[-2:])
+        with OpenEXR.File(str(path)) as file:
+            code = OpenEXR.TimeCode(1, 2, 3, number, *[False] * 6, *[0] * 8)
+            header = {**file.header(), "timeCode": code, "framesPerSecond": 24}
+            header = {k: v for k, v in header.items() if k in ("timeCode", "compression", "type")}
+            pixels = file.channels()["RGB"].pixels.copy()
+        OpenEXR.File(header, {"RGB": pixels}).write(str(path))
+    products = {"capture": "out", "matte": "beta/beta"}
+    for name, stem in products.items():
+        output = make(name, name, words=replaced(shot.arguments(name), 1, copy))
+        for number in (1001, 1004):
+            with OpenEXR.File(f"{output / stem}.{number}.exr") as file:
+                assert file.header()["timeCode"].frame == number % 100
+
+
+def test_a_movie_becomes_frames_from_1001_on(movie, command, tmp_path):
+    assert command("capture", movie, "-o", tmp_path / "take").code == 0
+    names = {path.name for path in (tmp_path / "take").glob("*.exr")}
+    assert names == {f"take.{number}.exr" for number in range(1001, 1006)}
+
+
+@pytest.mark.parametrize("name", ["take", "take[1]", "take*"])
+def test_a_movie_captured_twice_is_refused(name, movie, command, tmp_path, tree):
+    output = tmp_path / name
+    assert command("capture", movie, "-o", output, "-q").code == 0
+    before = times(output)
+    assert command("capture", movie, "-o", output, "-q", "--start", "1003").code == 1
+    assert times(output) == before
+
+
+def test_chunks_of_a_movie_equal_the_whole(movie, command, tmp_path, tree):
+    whole, parts = tmp_path / "whole/take", tmp_path / "parts/take"
+    assert command("capture", movie, "-o", whole, "-q").code == 0
+    for chunk in ("1001-1002", "1003-1005"):
+        assert command("capture", movie, "-o", parts, "-q", "--frames", chunk).code == 0
+    frames = {path: data for path, data in tree(whole).items() if path.endswith(".exr")}
+    assert {path: data for path, data in tree(parts).items() if path.endswith(".exr")} == frames
+    assert tree(parts)["shadowtool.json"] == tree(whole)["shadowtool.json"]
+
+
+def test_openjd_progress_of_a_movie_reaches_a_hundred_only_at_its_end(movie, command, tmp_path):
+    outcome = command("capture", movie, "-o", tmp_path / "take", "--progress", "openjd")
+    lines = [line for line in outcome.err.splitlines() if line.startswith("openjd_progress: ")]
+    assert lines.count("openjd_progress: 100.0") == 1
+    assert lines[-1] == "openjd_progress: 100.0"
+
+
+def test_frames_that_a_movie_does_not_have_are_named(movie, command, tmp_path):
+    outcome = command("capture", movie, "-o", tmp_path / "take", "--frames", "1004-1008")
+    assert outcome.code == 1
+    assert "1006-1008" in outcome.err

@@ -1,0 +1,262 @@
+"""Files appear whole or not at all."""
+
+import errno
+import os
+import socket
+import stat
+import subprocess
+import sys
+import threading
+import zlib
+from pathlib import Path
+
+import pytest
+
+from shadowtool.errors import InputError, RetryError, ShadowtoolError
+from shadowtool.io.files import (
+    fingerprint,
+    fingerprint_file,
+    make_folder,
+    read_bytes,
+    write_bytes,
+)
+
+RETRY = ["ENOSPC", "EDQUOT", "ESTALE", "EIO", "ETIMEDOUT", "EMFILE"]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def leftover(folder: Path, pid: object) -> Path:
+    host = f"{zlib.crc32(socket.gethostname().encode()):08x}"
+    path = folder / f".shadowtool-{host}-{pid}-7f-0.tmp"
+    path.write_bytes(b"half a frame")
+    return path
+
+
+def dead_process() -> int:
+    return int(subprocess.check_output([sys.executable, "-c", "import os; print(os.getpid())"]))
+
+
+@pytest.fixture
+def failing_write(monkeypatch):
+    """Make the next write to disk stop half-way with an error of the given name."""
+
+    def arrange(name: str) -> None:
+        opened = Path.open
+
+        def broken_open(self, *args, **kwargs):
+            file = opened(self, *args, **kwargs)
+            if "x" in (args[0] if args else kwargs.get("mode", "")):
+                whole = file.write
+
+                class Broken:
+                    def __enter__(self):
+                        return self
+
+                    def __exit__(self, *exc):
+                        file.close()
+
+                    def write(self, data):
+                        whole(bytes(data)[:3])
+                        raise OSError(getattr(errno, name), os.strerror(getattr(errno, name)))
+
+                return Broken()
+            return file
+
+        monkeypatch.setattr(Path, "open", broken_open)
+
+    return arrange
+
+
+def test_a_file_is_written_and_read_whole(tmp_path):
+    write_bytes(tmp_path / "a", memoryview(b"content"))
+    assert read_bytes(tmp_path / "a") == b"content"
+    assert names(tmp_path) == ["a"]
+
+
+def test_writing_replaces_what_was_there(tmp_path):
+    write_bytes(tmp_path / "a", b"long content")
+    write_bytes(tmp_path / "a", b"short")
+    assert read_bytes(tmp_path / "a") == b"short"
+
+
+@pytest.mark.parametrize("name", RETRY)
+def test_a_fault_of_the_machine_is_worth_a_retry_and_leaves_nothing(name, tmp_path, failing_write):
+    failing_write(name)
+    with pytest.raises(RetryError, match=r"frame\.exr") as caught:
+        write_bytes(tmp_path / "frame.exr", b"content")
+    assert caught.value.exit_code == 75
+    assert "\n" not in str(caught.value)
+    assert names(tmp_path) == []
+
+
+def test_a_failed_write_leaves_the_old_content(tmp_path, failing_write):
+    write_bytes(tmp_path / "a", b"old")
+    failing_write("ENOSPC")
+    with pytest.raises(RetryError):
+        write_bytes(tmp_path / "a", b"new content")
+    assert names(tmp_path) == ["a"]
+    assert (tmp_path / "a").read_bytes() == b"old"
+
+
+def test_a_failed_rename_leaves_no_temporary(tmp_path):
+    (tmp_path / "a").mkdir()
+    with pytest.raises(ShadowtoolError, match="cannot write"):
+        write_bytes(tmp_path / "a", b"content")
+    assert names(tmp_path) == ["a"]
+
+
+def test_an_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(self, target):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_bytes(tmp_path / "a", b"content")
+    assert names(tmp_path) == []
+
+
+def test_a_really_full_disk_is_worth_a_retry(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("no tmpfs may be mounted here")
+    try:
+        with pytest.raises(RetryError, match="No space left"):
+            write_bytes(disk / "a", bytes(1 << 20))
+        assert names(disk) == []
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize(("mask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
+def test_permissions_follow_the_umask(mask, mode, tmp_path):
+    before = os.umask(mask)
+    try:
+        write_bytes(tmp_path / "a", b"")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == mode
+
+
+def test_a_folder_that_is_gone_is_named(tmp_path):
+    with pytest.raises(ShadowtoolError, match="gone/a") as caught:
+        write_bytes(tmp_path / "gone" / "a", b"")
+    assert caught.value.exit_code == 1
+
+
+def test_threads_may_write_the_same_name_at_once(tmp_path):
+    contents = [bytes([number]) * 100_000 for number in range(8)]
+    threads = [
+        threading.Thread(target=write_bytes, args=(tmp_path / "a", content)) for content in contents
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (tmp_path / "a").read_bytes() in contents
+    assert names(tmp_path) == ["a"]
+
+
+def test_names_of_the_longest_length_can_be_written(tmp_path):
+    write_bytes(tmp_path / ("n" * 251 + ".exr"), b"x")
+    assert len(names(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"),
+    [
+        (lambda path: None, "no such file"),
+        (Path.mkdir, "cannot read"),
+        (lambda path: path.symlink_to(path), "cannot read"),
+    ],
+)
+def test_what_cannot_be_read_is_named(make, reason, tmp_path):
+    make(tmp_path / "a.exr")
+    with pytest.raises(InputError, match=rf"a\.exr: {reason}"):
+        read_bytes(tmp_path / "a.exr")
+
+
+def test_a_stale_file_handle_is_worth_a_retry(tmp_path, monkeypatch):
+    def stale(self):
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+
+    monkeypatch.setattr(Path, "read_bytes", stale)
+    with pytest.raises(RetryError, match="cannot read"):
+        read_bytes(tmp_path / "a")
+
+
+def test_names_that_are_too_long_are_refused(tmp_path):
+    with pytest.raises(InputError, match="File name too long"):
+        read_bytes(tmp_path / ("n" * 10_000))
+
+
+def test_a_folder_is_made_with_its_parents(tmp_path):
+    make_folder(tmp_path / "a/b/c")
+    make_folder(tmp_path / "a/b/c")
+    assert (tmp_path / "a/b/c").is_dir()
+
+
+def test_leftovers_of_dead_processes_are_swept(tmp_path):
+    gone = leftover(tmp_path, dead_process())
+    make_folder(tmp_path)
+    assert not gone.exists()
+
+
+def test_leftovers_of_living_processes_stay(tmp_path):
+    mine, other = leftover(tmp_path, os.getpid()), leftover(tmp_path, os.getppid())
+    make_folder(tmp_path)
+    assert mine.exists()
+    assert other.exists()
+
+
+def test_leftovers_of_other_machines_stay(tmp_path):
+    foreign = tmp_path / f".shadowtool-00000000-{dead_process()}-7f-0.tmp"
+    foreign.write_bytes(b"")
+    make_folder(tmp_path)
+    assert foreign.exists()
+
+
+@pytest.mark.parametrize("pid", ["x", "", "99999999999999999999"])
+def test_leftovers_that_name_no_process_are_swept(pid, tmp_path):
+    gone = leftover(tmp_path, pid)
+    make_folder(tmp_path)
+    assert not gone.exists()
+
+
+def test_nothing_else_is_swept(tmp_path):
+    kept = ["a.1001.exr", ".hidden", "shadowtool.json", ".shadowtool-notes"]
+    for name in kept:
+        (tmp_path / name).write_bytes(b"")
+    make_folder(tmp_path)
+    assert names(tmp_path) == sorted(kept)
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "n" * 10_000])
+def test_a_folder_that_cannot_be_made_is_refused(place, tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(ShadowtoolError) as caught:
+        make_folder(tmp_path / place)
+    assert caught.value.exit_code == 1
+    assert str(caught.value).startswith(str(tmp_path))
+
+
+def test_fingerprints_tell_contents_apart(tmp_path):
+    contents = [b"", b"\0", b"\0\0", b"a", b"b", b"ab", b"ba"]
+    assert len({fingerprint(content) for content in contents}) == len(contents)
+
+
+def test_a_files_fingerprint_is_its_contents(tmp_path):
+    (tmp_path / "a").write_bytes(b"content")
+    (tmp_path / "b").write_bytes(b"content")
+    os.utime(tmp_path / "b", (0, 0))
+    assert fingerprint_file(tmp_path / "a") == fingerprint_file(tmp_path / "b")
+    assert fingerprint_file(tmp_path / "a") == fingerprint(b"content")
+
+
+def test_the_fingerprint_of_a_missing_file_is_an_error(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        fingerprint_file(tmp_path / "a")

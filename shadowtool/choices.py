@@ -5,7 +5,7 @@ It imports nothing heavy, so that ``--help`` answers at once.
 
 from typing import Literal, get_args
 
-Estimator = Literal["minmax"]
+Estimator = Literal["robust", "minmax"]
 Fill = Literal["inpaint", "lit", "none"]
 Format = Literal["exr", "png"]
 Missing = Literal["error", "skip"]

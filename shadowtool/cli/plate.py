@@ -21,9 +21,17 @@ from shadowtool.cli.options import step_command, transfer_option
 @click.option(
     "--estimator",
     type=click.Choice(ESTIMATORS),
-    default="minmax",
+    default="robust",
     show_default=True,
-    help="minmax: the extremes over all frames, Eq. (4) of the paper.",
+    help="robust: means of the frames in which a pixel was lit, and fully shaded; where the shadow"
+    " fell only in part, the plane's ratio of shadow to light. minmax: the extremes over all"
+    " frames, Eq. (4) of the paper.",
+)
+@click.option(
+    "--plane",
+    metavar="IMAGE|POLYGON",
+    help="The plane that the shadow falls on, as for scan. Default: all of the picture if the"
+    " shadow reached less than most of it.",
 )
 @transfer_option
 @step_command

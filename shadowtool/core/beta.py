@@ -16,6 +16,9 @@ Bool = NDArray[np.bool_]
 _LARGEST_HOLE = 0.005
 # Below this many standard deviations between L and S, β would be off by more than 0.1.
 _LEAST_CONTRAST = 10.0
+_WINDOW = 5
+# Half the contrast's reciprocal more noise in full light, and so many deviations to be sure.
+_LIT_NOISE, _SURE = 0.7, 3.0
 
 
 def shadow_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> Float32:
@@ -75,6 +78,44 @@ def unknown_beta(contrast: Float32, frames: NDArray[np.uint32] | None) -> Bool:
     # Each channel has extremes of its own, and the contrast is the root of the sum of squares.
     least = np.maximum(np.sqrt(np.float32(3)) * extreme_range(frames), _LEAST_CONTRAST)
     return np.asarray(~(contrast > least))
+
+
+def without_noise(beta: Float32, contrast: Float32) -> Float32:
+    """β cleared of noise as far as the picture around it allows; exactly 1 where it is lit.
+
+    A Wiener filter over a small window: what a pixel's neighbours scatter beyond their noise is
+    structure, an edge or a penumbra, and stays; what the noise explains goes. Where neither the
+    pixel nor the window's mean lies below 1 by more than their noise, β is 1.
+
+    Args:
+        beta: (H, W) float32, not clipped; NaN unknown, which takes no part.
+        contrast: (H, W), 1 over the standard error of each pixel's β.
+
+    Returns:
+        (H, W) float32 with the same NaN; within the range of what went in.
+    """
+    known = np.isfinite(beta) & np.isfinite(contrast) & (contrast > 0)
+    # In the light the noise is larger than half-way, for which the contrast stands.
+    weight = np.where(known, contrast * np.float32(_LIT_NOISE), np.float32(0)) ** 2
+    values = np.where(known, beta, np.float32(1))
+    total = _window_sum(weight)
+    safe = np.maximum(total, np.float32(1e-12))
+    mean = _window_sum(weight * values) / safe
+    scatter = np.maximum(_window_sum(weight * values**2) / safe - mean**2, 0)
+    noise = _window_sum(known.astype(np.float32)) / safe
+    structure = np.maximum(scatter - noise, 0)
+    keep = structure / (structure + 1 / np.maximum(weight, np.float32(1e-12)))
+    result = mean + keep * (values - mean)
+    lit = ((1 - mean) * np.sqrt(total) < _SURE) & ((1 - values) * np.sqrt(weight) < _SURE + 1)
+    result = np.where(lit & (structure < noise * _WINDOW**2), np.float32(1), result)
+    return np.where(known, result, beta).astype(np.float32)
+
+
+def _window_sum(image: Float32) -> Float32:
+    """The sum over the window around each pixel, (H, W)."""
+    box = (_WINDOW, _WINDOW)
+    total = cv2.boxFilter(image, -1, box, normalize=False, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(total, np.float32)
 
 
 def fill_beta(beta: Float32, never_shaded: Bool, hidden: Bool, fill: Fill) -> Float32:

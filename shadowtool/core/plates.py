@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_keys import all_finite, from_keys, to_keys
+
 Float32 = NDArray[np.float32]
 
 
@@ -18,13 +20,16 @@ class Plates:
     Attributes:
         lit: (H, W, 3) float32, linear light; NaN where no frame showed the pixel.
         shadow: (H, W, 3) float32, likewise.
-        frames: (H, W) uint32, the number of frames that showed the pixel; None for plates that
-            come from elsewhere (a renderer, a paint program).
+        frames: (H, W) uint32, the number of frames that the lit plate rests on; None for plates
+            that come from elsewhere (a renderer, a paint program).
+        shadow_frames: (H, W) uint32, likewise for the shadow plate; None for extremes, for which
+            every frame counts in both.
     """
 
     lit: Float32
     shadow: Float32
     frames: NDArray[np.uint32] | None = None
+    shadow_frames: NDArray[np.uint32] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -98,21 +103,12 @@ def _order_keys(image: NDArray[np.floating]) -> NDArray[np.int16] | Float32:
     """Values that compare as the image's do: int16 for halfs, float32 else."""
     if image.dtype != np.float16:
         return np.asarray(image, np.float32)
-    bits = np.ascontiguousarray(image).view(np.int16)
-    return _flip_negative(bits)
-
-
-def _flip_negative(bits: NDArray[np.int16]) -> NDArray[np.int16]:
-    # Halfs are sign and magnitude: among negative ones a larger magnitude is a smaller number.
-    # Flipping the magnitude's bits makes the integers ascend; doing it twice gives them back.
-    if bits.size and bits.min() < 0:
-        return bits ^ ((bits >> 15) & np.int16(0x7FFF))
-    return bits
+    return to_keys(image.astype(np.float16, copy=False))
 
 
 def _values(keys: NDArray[np.int16] | Float32) -> Float32:
     if keys.dtype == np.int16:
-        return _flip_negative(keys.astype(np.int16)).view(np.float16).astype(np.float32)
+        return from_keys(keys.astype(np.int16)).astype(np.float32)
     return keys.astype(np.float32)
 
 
@@ -121,11 +117,10 @@ def _seen(
 ) -> NDArray[np.bool_] | None:
     """Where the frame shows the background, or None for everywhere."""
     if image.dtype == np.float16:
-        magnitude = np.ascontiguousarray(image).view(np.uint16) & np.uint16(0x7FFF)
-        finite = magnitude < np.uint16(0x7C00)
+        finite = all_finite(image)
     else:
-        finite = np.isfinite(image)
-    seen = None if finite.all() else np.asarray(finite.all(axis=-1), bool)
+        finite = np.asarray(np.isfinite(image).all(axis=-1), bool)
+    seen = None if finite.all() else finite
     if holdout is not None:
         # NaN in a matte says nothing in favour of the pixel.
         free = np.asarray(holdout <= 0)

@@ -64,17 +64,24 @@ def read_plates(folder: Path) -> StoredPlates:
             f"{folder}: lit is {_size(lit.header)}, shadow is {_size(shadow.header)};"
             " plates must be of one size"
         )
-    frames = None
+    frames = shadow_frames = None
     confidence = folder / f"confidence{EXR}"
     if is_file(confidence):
         image = read_image(confidence)
         images.append(image)
-        counts = np.nan_to_num(image.channel("frames"), posinf=0, neginf=0)
-        frames = np.clip(counts, 0, 2**31).astype(np.uint32)
+        frames = _counts(image.channel("frames"))
+        if "shadow_frames" in image.layers:
+            shadow_frames = _counts(image.channel("shadow_frames"))
         if image.header.size != lit.header.size:
             raise InputError(f"{confidence}: is not of the plates' size")
-    plates = Plates(lit.rgb().astype(np.float32), shadow.rgb().astype(np.float32), frames)
+    colours = (lit.rgb().astype(np.float32), shadow.rgb().astype(np.float32))
+    plates = Plates(*colours, frames, shadow_frames)
     return StoredPlates(plates, lit.header, " ".join(i.fingerprint for i in images))
+
+
+def _counts(values: NDArray[np.float32]) -> NDArray[np.uint32]:
+    counts = np.clip(np.nan_to_num(values, posinf=0, neginf=0), 0, 2**31)
+    return np.asarray(counts, np.uint32)
 
 
 def _plate(folder: Path, name: str) -> Path:
@@ -91,12 +98,14 @@ def write_plates(
     header: Header,
     provenance: Provenance,
 ) -> None:
-    """Write lit, shadow and confidence (channels contrast and frames)."""
+    """Write lit, shadow and confidence (channels contrast, frames, maybe shadow_frames)."""
     lit, shadow, confidence = plate_files(folder)
     write_exr(lit, {"RGB": plates.lit}, header, provenance)
     write_exr(shadow, {"RGB": plates.shadow}, header, provenance)
     frames = plates.frames if plates.frames is not None else np.zeros(contrast.shape)
     layers = {"contrast": contrast, "frames": frames.astype(np.float32)}
+    if plates.shadow_frames is not None:
+        layers["shadow_frames"] = plates.shadow_frames.astype(np.float32)
     write_exr(confidence, layers, header, provenance)
 
 

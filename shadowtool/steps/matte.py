@@ -67,7 +67,9 @@ def matte(
     noise = footage.measure_noise(run.jobs)
     scene = stored.plates
     never_shaded = shadow_beta.unknown_beta(
-        contrast := shadow_beta.shadow_contrast(scene, noise), scene.frames
+        contrast := shadow_beta.shadow_contrast(scene, noise),
+        # Means have no range of extremes to allow for.
+        scene.frames if scene.shadow_frames is None else None,
     )
     known_confidence = np.clip(1 - 1 / np.maximum(contrast, 1e-6), 0, 1)
     known_confidence[never_shaded] = 0
@@ -125,8 +127,9 @@ def matte(
                 return {}
             coverage = difference_alpha(distance, regions)
         hidden = coverage > 0
-        known = np.clip(shadow_beta.shadow_matte(image, scene.lit, scene.shadow), 0, 1)
+        known = shadow_beta.shadow_matte(image, scene.lit, scene.shadow)
         known[never_shaded | hidden] = np.nan
+        known = np.clip(shadow_beta.without_noise(known, contrast), 0, 1)
         unknown = np.isnan(known)
         filled = shadow_beta.fill_beta(known, never_shaded, hidden, fill)
         figures = {

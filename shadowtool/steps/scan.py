@@ -2,10 +2,8 @@
 
 import logging
 import math
-import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,13 +18,14 @@ from shadowtool.core.shadow_time import (
     luminance,
 )
 from shadowtool.core.warp_map import Pass, line_speed
-from shadowtool.errors import DamagedFileError, InputError, OptionError, ReshootError
+from shadowtool.errors import DamagedFileError, InputError, ReshootError
 from shadowtool.io.files import fingerprint_file, make_folder
-from shadowtool.io.image import Header, read_image, write_png
+from shadowtool.io.image import write_png
 from shadowtool.io.products import LINES, MANIFEST, SCAN, write_scan
 from shadowtool.io.sequence import Frame
 from shadowtool.parallel import ordered_map
-from shadowtool.steps.footage import Footage, open_footage, require_size
+from shadowtool.steps.footage import Footage, open_footage
+from shadowtool.steps.plane import read_plane
 from shadowtool.steps.run import (
     Figures,
     Recipe,
@@ -41,7 +40,6 @@ logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 PICTURE = "scan.png"
-_POINT = re.compile(r"-?\d+(?:\.\d+)?,-?\d+(?:\.\d+)?")
 
 
 def scan(
@@ -105,32 +103,6 @@ def scan(
     write_png(output / PICTURE, time_picture(first, times.time, lines, region), provenance)
     write_manifest(output, recipe, mark, figures)
     return Result("scan", output, used, 0, skipped, figures)
-
-
-def read_plane(plane: str, header: Header) -> tuple[NDArray[np.bool_], str]:
-    """The reference plane region (H, W) and a fingerprint of it.
-
-    Raises:
-        InputError: no such mask, or of another size.
-        OptionError: a polygon of fewer than three points, or outside the picture.
-    """
-    words = plane.split()
-    if words and all(_POINT.fullmatch(word) for word in words):
-        if len(words) < 3:
-            raise OptionError(f"--plane {plane}: a polygon takes three points or more")
-        points = np.array([[float(v) for v in word.split(",")] for word in words])
-        region = np.zeros((header.height, header.width), np.uint8)
-        corners = np.rint(np.clip(points, -1e6, 1e6)).astype(np.int32)
-        cv2.fillPoly(region, [corners], 255)
-        name = " ".join(words)
-    else:
-        image = read_image(Path(plane))
-        require_size(image.path, image.header, header, "the footage")
-        region = (image.plane("A", "Y", "G") > 0.5).astype(np.uint8)
-        name = image.fingerprint
-    if not region.any():
-        raise OptionError(f"--plane {plane}: no pixel of the picture lies inside")
-    return region > 0, name
 
 
 def _times(

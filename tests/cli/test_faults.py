@@ -513,7 +513,7 @@ def test_running_out_of_memory_is_worth_a_retry(shot, command, tmp_path, monkeyp
     def starved(*args, **kwargs):
         raise MemoryError
 
-    monkeypatch.setattr("shadowtool.steps.plate.ExtremePlates.add", starved)
+    monkeypatch.setattr("shadowtool.steps.plate.RobustPlates.add", starved)
     outcome = command(*shot.arguments("plate"), "-o", tmp_path / "out")
     assert outcome.code == 75
     assert outcome.err.startswith("shadowtool: error: out of memory")

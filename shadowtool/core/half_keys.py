@@ -1,0 +1,73 @@
+"""Half floats as integers that compare alike.
+
+The bits of a half are a piecewise linear logarithm of it: a step of one is a change of about a
+thousandth, and 16-bit integers are compared and added many times faster than halfs.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Int16 = NDArray[np.int16]
+Float32 = NDArray[np.float32]
+
+# Below this exponent halfs are evenly spaced.
+_LEAST_EXPONENT = -14
+
+
+def to_keys(halfs: NDArray[np.float16]) -> Int16:
+    """Integers in the order of the halfs; -0 comes just below 0, NaN beyond infinity."""
+    return _folded(np.ascontiguousarray(halfs).view(np.int16))
+
+
+def from_keys(keys: Int16) -> NDArray[np.float16]:
+    """The inverse of `to_keys`."""
+    return _folded(keys).view(np.float16)
+
+
+def _folded(bits: Int16) -> Int16:
+    # Halfs are sign and magnitude: among negative ones a larger magnitude is a smaller number.
+    # Flipping the magnitude's bits makes the integers ascend; doing it twice gives them back.
+    if bits.size and bits.min() < 0:
+        return np.asarray(bits ^ ((bits >> 15) & np.int16(0x7FFF)), np.int16)
+    return bits
+
+
+def mean_of_keys(total: NDArray[np.integer], count: NDArray[np.integer]) -> Float32:
+    """The values that sums of keys stand for, with fractions of a key kept.
+
+    The mean of keys is the mean of values where these differ by little: off by a hundredth of
+    their spread, and by a tenth of it where that straddles a power of two.
+
+    Args:
+        total: sums of keys.
+        count: of how many each is; NaN comes of none.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = total / count.astype(np.float64)
+    low = np.floor(np.nan_to_num(mean)).astype(np.int16)
+    below = from_keys(low).astype(np.float32)
+    above = from_keys(low + np.int16(1)).astype(np.float32)
+    values = below + (above - below) * (mean - low)
+    return np.where(np.isnan(mean), np.nan, values).astype(np.float32)
+
+
+def keys_per_unit(values: NDArray[np.floating]) -> Float32:
+    """How many keys lie in a change of 1 at these values, float32."""
+    _, exponent = np.frexp(np.abs(values).astype(np.float32))
+    steps = np.ldexp(np.float32(1024), -np.maximum(exponent - 1, _LEAST_EXPONENT))
+    return np.asarray(steps, np.float32)
+
+
+def gray_keys(keys: Int16) -> Int16:
+    """One key a pixel, (H, W), of the keys of its three channels (H, W, 3)."""
+    gray = keys[..., 1] >> 1
+    gray += keys[..., 0] >> 2
+    gray += keys[..., 2] >> 2
+    return np.asarray(gray, np.int16)
+
+
+def all_finite(halfs: NDArray[np.float16]) -> NDArray[np.bool_]:
+    """Where no channel is NaN or infinite, (H, W) for (H, W, 3)."""
+    magnitude = np.ascontiguousarray(halfs).view(np.uint16) & np.uint16(0x7FFF)
+    finite = magnitude < np.uint16(0x7C00)
+    return np.asarray(finite.all(axis=-1), bool)

@@ -1,0 +1,185 @@
+"""Shadow plates where the shadow never fell in full.
+
+On a plane under one key light S/L is nearly the same everywhere. It is measured where the shadow
+fell in full, and serves, in proportion to the lack of evidence, where it didn't: at the rim of the
+region that a shadow swept, where only its penumbra passed.
+
+A partial shadow and a surface with another S/L (steeper, glossier) are both brighter than expected.
+They are told apart by their shape: at a rim S/L climbs from full shadow to none within the width of
+a penumbra, on a surface it is level.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.filling import fill_membrane
+
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+# Frames that a pixel's shadow value must rest on to tell what the ratio is.
+_FIRM = 3
+# Log ratios further than this from the common one belong to another surface or to a penumbra.
+_COMMON = 0.45
+# The slope of log(S/L), per pixel, at which a partial shadow is as likely as a surface.
+_SLOPE = 0.05
+# A shadow that reached more than this part of a picture was cast to reach all of it.
+_MOST = 0.6
+# Within this many times the materials' spread a measured ratio is the plane's.
+_ALIKE = 2.5
+# How far S/L of one plane's materials lies from their common one, as a part; at least.
+_LEAST_SPREAD = 0.03
+
+
+def shadow_ratio_field(
+    lit: Float32, shadow: Float32, frames: NDArray[np.uint32], plane: Bool | None
+) -> tuple[Float32, float] | None:
+    """The smoothly varying S/L of the scene's main plane, and how far materials scatter about it.
+
+    Args:
+        lit, shadow: (H, W, 3), NaN unknown.
+        frames: (H, W), how many frames the shadow rests on.
+        plane: (H, W), where to look; None for everywhere.
+
+    Returns:
+        (H, W, 3) float32 and the spread of log ratios; None if nothing was shaded in full.
+    """
+    ratio, gray = _log_ratios(lit, shadow)
+    firm = (frames >= _FIRM) & np.isfinite(gray)
+    if plane is not None:
+        firm &= plane
+    # What climbs is a penumbra, however long it stood there.
+    level = firm & (_slope(gray) < _SLOPE)
+    if level.sum() < 50:
+        return None
+    common = _mode(gray[level])
+    members = level & (np.abs(gray - common) < _COMMON)
+    field = _smooth(ratio, members)
+    members &= np.abs(gray - field.mean(axis=-1)) < _COMMON / 2
+    if members.sum() < 50:
+        return None
+    field = _smooth(ratio, members)
+    scatter = np.abs(gray - field.mean(axis=-1))[members]
+    spread = max(float(np.median(scatter)) / 0.6745, _LEAST_SPREAD)
+    return np.exp(field), spread
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A shadow plate without gaps.
+
+    Attributes:
+        shadow: (H, W, 3) float32; equal to the lit plate where there is nothing to go by.
+        own: (H, W) float32, how much of each pixel is its own evidence, 0 to 1.
+        partial: whether the take was read as that of a plane which a shadow covered in part.
+    """
+
+    shadow: Float32
+    own: Float32
+    partial: bool
+
+
+def complete_shadow(
+    lit: Float32,
+    shadow: Float32,
+    frames: NDArray[np.uint32],
+    noise: Float32,
+    plane: Bool | None = None,
+) -> Completed:
+    """The shadow plate with S/L of the plane where the shadow itself says too little.
+
+    A take in which the shadow reached most of the picture is that of a waved card: what it never
+    darkened is in shade of its own, and what it darkened for several frames is as dark as it gets.
+    Else it is that of a plane which a shadow crossed: what is brighter than the plane's shadow was
+    shaded in part, and what was never darkened would be as dark as the rest.
+
+    Args:
+        lit, shadow: (H, W, 3) float32, shadow NaN where the pixel was never darkened.
+        frames: (H, W), how many frames the shadow rests on.
+        noise: (H, W, 3), standard deviation of one frame's noise at ``shadow``.
+        plane: (H, W) the region of the plane, if it is known: the second reading holds there, the
+            first elsewhere.
+    """
+    dark = np.asarray(np.isfinite(shadow).all(axis=-1))
+    measured = np.asarray(np.where(dark[..., None], shadow, lit), np.float32)
+    firm = frames >= _FIRM
+    seen = np.isfinite(lit).all(axis=-1)
+    if plane is None:
+        partial = bool((firm & seen).sum() < _MOST * max(int(seen.sum()), 1))
+        region = np.full(dark.shape, partial)
+    else:
+        partial, region = True, plane
+    found = shadow_ratio_field(lit, shadow, frames, plane)
+    if found is None:
+        return Completed(measured, np.asarray(dark, np.float32), partial=False)
+    field, spread = found
+    expected = field * lit
+    _, gray = _log_ratios(lit, shadow)
+    excess = np.nan_to_num(gray - np.log(field).mean(axis=-1), nan=np.inf)
+    # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
+    precision = np.maximum(frames, 1)[..., None] / np.maximum(noise, 1e-6) ** 2
+    prior = 1 / np.maximum(spread * expected, 1e-6) ** 2
+    blend = (precision * measured + prior * expected) / (precision + prior)
+    alike: Bool = np.logical_and(np.abs(excess) < _ALIKE * spread, region)
+    result = np.where(alike[..., None], blend, measured)
+    brighter, darker = excess >= _ALIKE * spread, excess <= -_ALIKE * spread
+    # On the plane only what is level over some area can be a surface of its own.
+    surface = dark & firm & (_slope(np.where(dark, gray, np.float32(0))) < _SLOPE)
+    surface = cv2.morphologyEx(surface.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5))) > 0
+    few = np.minimum(frames / np.float32(_FIRM), 1)
+    own = np.where(dark, np.float32(1), np.float32(0))
+    own = np.where(region & dark & darker, few, own)
+    own[region & brighter & ~surface] = 0
+    kept = own.copy()
+    kept[~dark & ~region] = 1
+    mixed = kept[..., None] * result + (1 - kept[..., None]) * expected
+    return Completed(np.asarray(mixed, np.float32), np.asarray(own, np.float32), partial)
+
+
+def _log_ratios(lit: Float32, shadow: Float32) -> tuple[Float32, Float32]:
+    """log(S/L) of each channel, and of their weighted sum; NaN where unknown or not positive."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        channels = np.log(np.maximum(shadow, 1e-5) / np.maximum(lit, 1e-5))
+        gray = np.log(np.maximum(shadow.sum(axis=-1), 1e-5) / np.maximum(lit.sum(axis=-1), 1e-5))
+    return channels.astype(np.float32), gray.astype(np.float32)
+
+
+def _slope(gray: Float32) -> Float32:
+    """Length of the gradient of a smoothed log ratio, per pixel; unknown pixels count as 0,
+    which is no shadow at all."""
+    known = np.isfinite(gray)
+    smooth = cv2.medianBlur(np.where(known, gray, np.float32(0)), 5)
+    smooth = cv2.GaussianBlur(smooth, (0, 0), 1.5)
+    x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8
+    y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8
+    return np.asarray(np.hypot(x, y), np.float32)
+
+
+def _mode(values: Float32) -> float:
+    """The most frequent value: the darkest of the peaks that are nearly as high as the highest."""
+    counts, edges = np.histogram(values, bins=120, range=(-6.0, 0.5))
+    smooth = np.convolve(counts, [1, 2, 3, 2, 1], mode="same")
+    peak = int(np.argmax(smooth))
+    return float((edges[peak] + edges[peak + 1]) / 2)
+
+
+def _smooth(ratio: Float32, members: Bool) -> Float32:
+    """The members' log ratios, averaged over an eighth of the picture, continued everywhere."""
+    height, width = members.shape
+    weight = members.astype(np.float32)
+    sigma = max(width, height) / 16
+    total = cv2.GaussianBlur(weight, (0, 0), sigma)
+    values = np.where(members[..., None], ratio, np.float32(0))
+    mean = cv2.GaussianBlur(values, (0, 0), sigma) / np.maximum(total, np.float32(1e-9))[..., None]
+    firm = total > 0.02
+    if not firm.any():
+        firm = total >= total.max()
+    small = (max(width // 8, 1), max(height // 8, 1))
+    coarse = cv2.resize(np.where(firm[..., None], mean, np.float32(0)), small, interpolation=0)
+    known = cv2.resize(firm.astype(np.float32), small, interpolation=0)
+    filled = fill_membrane(np.asarray(coarse, np.float32), np.asarray(known, np.float32))
+    wide = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(np.where(firm[..., None], mean, wide), np.float32)

@@ -13,10 +13,11 @@ from shadowtool.cli.options import step_command, transfer_option
 @click.argument("source", metavar="FRAMES")
 @click.option(
     "--holdout",
-    metavar="FRAMES|none",
-    default="none",
+    metavar="FRAMES|auto|none",
+    default="auto",
     show_default=True,
-    help="A matte, roto or trimap sequence; where it is above 0 the pixel is left out.",
+    help="A matte, roto or trimap sequence; where it is above 0 the pixel is left out. auto: what"
+    " isn't background is found, and written to holdout/ to be looked at.",
 )
 @click.option(
     "--estimator",
@@ -35,7 +36,7 @@ from shadowtool.cli.options import step_command, transfer_option
 )
 @transfer_option
 @step_command
-def command(source: str, holdout: str, output: Path, **options: Any) -> list[Any]:
+def command(source: str, output: Path, **options: Any) -> list[Any]:
     """Find the scene fully lit and fully in shadow, from frames with a moving shadow.
 
     Writes lit.exr, shadow.exr and confidence.exr (contrast between the two in units of the
@@ -43,4 +44,4 @@ def command(source: str, holdout: str, output: Path, **options: Any) -> list[Any
     """
     from shadowtool.steps.plate import plate
 
-    return [plate(source, output, holdout=None if holdout == "none" else holdout, **options)]
+    return [plate(source, output, **options)]

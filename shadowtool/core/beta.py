@@ -37,9 +37,9 @@ def shadow_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> 
     range_red, range_green, range_blue = (lit[..., c] - shadow[..., c] for c in range(3))
     projection = above_red * range_red + above_green * range_green + above_blue * range_blue
     length = range_red**2 + range_green**2 + range_blue**2
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         beta = projection / length
-    beta[~(length > 0)] = np.nan
+    beta[~((length > 0) & np.isfinite(projection))] = np.nan
     return np.asarray(beta, np.float32)
 
 

@@ -37,8 +37,8 @@ def shadow_ratio(shaded: Float32, lit: Float32) -> Float32:
     """What the lit plate is to be multiplied by to be in shadow: C'/L'.
 
     Returns:
-        (H, W, 3) float32, 1 where the lit plate is black.
+        (H, W, 3) float32 ≥ 0, 1 where the lit plate is black.
     """
     ratio = np.ones_like(shaded)
     np.divide(shaded, lit, out=ratio, where=lit > 0)
-    return ratio
+    return np.maximum(ratio, 0)

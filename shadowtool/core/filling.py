@@ -28,6 +28,7 @@ def fill_membrane(values: Float32, weight: Float32) -> Float32:
     known = weight > 0
     if not known.any():
         return np.zeros_like(values)
+    weight = np.where(known, np.maximum(weight / weight.max(), np.float32(1e-6)), np.float32(0))
     filled = values.copy()
     labels, boxes = _parts(~known)
     for label, (rows, columns) in boxes.items():

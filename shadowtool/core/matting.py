@@ -10,9 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.noise import NoiseModel
-from shadowtool.core.plates import Plates
-
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
@@ -31,38 +28,11 @@ class Figure(NamedTuple):
     alpha: Float32
 
 
-def line_distance(image: Float32, plates: Plates, noise: NoiseModel) -> Float32:
-    """How far each pixel lies from the line between L and S, in standard deviations.
-
-    The line ends at S and L: brighter than lit or darker than shadow is off it. Where a plate is
-    unknown the distance is 0.
-
-    Args:
-        image: (H, W, 3) float32, linear light.
-
-    Returns:
-        (H, W) float32 ≥ 0.
-    """
-    span = plates.lit - plates.shadow
-    middle = (plates.lit + plates.shadow) / 2
-    # With each channel in units of its noise the nearest point is the likeliest.
-    weight = 1 / np.maximum(noise.sigma(middle), 1e-6)
-    above = (image - plates.shadow) * weight
-    direction = span * weight
-    length2 = (direction**2).sum(axis=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        beta = np.clip((above * direction).sum(axis=-1) / length2, 0, 1)
-    beta[~(length2 > 0)] = 0
-    residual = above - beta[..., None] * direction
-    distance = np.sqrt((residual**2).sum(axis=-1))
-    return np.asarray(np.nan_to_num(distance, nan=0.0, posinf=1e6), np.float32)
-
-
 def difference_trimap(distance: Float32, band: int = 3) -> UInt8:
     """A trimap by difference.
 
     Args:
-        distance: (H, W) from `line_distance`.
+        distance: (H, W) from `color_line.line_distance`.
         band: half the width of the unknown band, pixels.
 
     Returns:
@@ -87,7 +57,7 @@ def difference_alpha(distance: Float32, trimap: UInt8) -> Float32:
     """Alpha by difference: 0 on the line between L and S, 1 far from it.
 
     Args:
-        distance: (H, W) from `line_distance`.
+        distance: (H, W) from `color_line.line_distance`.
         trimap: (H, W) uint8; 0 and 255 are kept as they are.
 
     Returns:
@@ -111,9 +81,9 @@ def pull_figure(image: Float32, alpha: Float32, background: Float32) -> Figure:
         background: (H, W, 3), βL + (1 - β)S; NaN counts as black.
 
     Returns:
-        The figure; its colour is at least 0, and 0 where alpha is.
+        The figure; its colour is at least 0, and 0 where alpha or the picture is unknown.
     """
-    foreground = image - (1 - alpha[..., None]) * np.nan_to_num(background)
+    foreground = np.nan_to_num(image) - (1 - alpha[..., None]) * np.nan_to_num(background)
     foreground[alpha == 0] = 0
     return Figure(np.maximum(foreground, 0).astype(np.float32), alpha)
 

@@ -128,11 +128,13 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
     measured = _spreads([(samples[a], samples[b]) for a, b in near], _NEAR)
     if not measured:
         return []
-    values, sigmas, frozen = np.median(measured, axis=0)
+    values, sigmas, frozen, steps = np.median(measured, axis=0)
     if np.median(frozen) > _FROZEN and (
         distant := _spreads([(samples[a], samples[b]) for a, b in far], _FAR)
     ):
-        values, sigmas, _ = np.quantile(distant, _FAR_QUANTILE, axis=0)
+        values, sigmas, _, steps = np.quantile(distant, _FAR_QUANTILE, axis=0)
+    # Noise that rounding to code values hides is as large as the rounding.
+    sigmas = np.sqrt(sigmas**2 + steps**2 / 12)
     return [
         NoiseLevel(channel, float(values[level, channel]), float(sigmas[level, channel]))
         for channel in range(3)
@@ -155,12 +157,15 @@ def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
             values = np.array([max(level.value, 0.0) for level in own])
             variances = np.array([level.sigma**2 for level in own])
             slope[channel], floor[channel] = _non_negative_line(values, variances)
+            # In the dark, rounding counts most, and the line must not pass below it.
+            darkest = float(variances[0] - slope[channel] * values[0])
+            floor[channel] = max(floor[channel], darkest)
     return NoiseModel(slope, np.maximum(floor, least**2))
 
 
 def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) -> list[Float64]:
-    """For each pair of thinned frames (3, levels, 3): brightness, standard deviation, and the part
-    of the differences that are next to nothing."""
+    """For each pair of thinned frames (4, levels, 3): brightness, standard deviation, the part of
+    the differences that are next to nothing, and the step between code values."""
     spreads = []
     for first, second in pairs:
         usable = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
@@ -171,7 +176,7 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
         brighter = np.maximum(first[usable], second[usable])
         # The variance of a difference is twice that of one frame.
         difference = np.abs(first[usable] - second[usable]) / np.float32(np.sqrt(2))
-        spread = np.empty((3, _LEVELS, 3))
+        spread = np.empty((4, _LEVELS, 3))
         for channel in range(3):
             order = np.argsort(brighter[:, channel], kind="stable")
             for level, rows in enumerate(np.array_split(order, _LEVELS)):
@@ -180,8 +185,16 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
                 spread[0, level, channel] = np.median(brighter[rows, channel])
                 spread[1, level, channel] = np.quantile(own, part[0]) / part[1]
                 spread[2, level, channel] = (own <= 0.1 * median).mean()
+                spread[3, level, channel] = _code_step(first[usable][rows, channel])
         spreads.append(spread)
     return spreads
+
+
+def _code_step(values: Float32) -> float:
+    """The distance of neighbouring code values in coarsely stored footage, next to 0 in fine."""
+    low, high = np.quantile(values, (0.05, 0.95))
+    distinct = np.unique(values[(values >= low) & (values <= high)])
+    return float(distinct[-1] - distinct[0]) / max(len(distinct) - 1, 1)
 
 
 def _non_negative_line(x: Float64, y: Float64) -> tuple[float, float]:

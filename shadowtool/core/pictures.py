@@ -45,6 +45,7 @@ def time_picture(
         phase = np.nan_to_num(np.mod(time, every), nan=0.0) / every
         strength = (known * (0.35 + 0.3 * phase)).astype(np.float32)[..., None]
         canvas = (canvas * (1 - strength) + colours * strength).astype(np.uint8)
+        _write(canvas, f"frame {low:.0f} (blue) to {high:.0f} (red)")
     if plane is not None:
         outline, _ = cv2.findContours(
             plane.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
@@ -79,12 +80,19 @@ def warp_picture(image: NDArray[np.floating], warp_map: WarpMap, step: int = 16)
     for axis in (0, 1):
         changed = (np.diff(cell, axis=axis) != 0).any(axis=-1)
         edge[: changed.shape[0], : changed.shape[1]] |= changed
-    canvas[edge] = _GREEN
+    canvas[edge & measured] = _GREEN
     displacement = np.linalg.norm(warp - identity_map(height, width), axis=-1)
     top = max(float(np.percentile(displacement[measured], 99)), 1.0) if measured.any() else 1.0
     parallax = _colours(np.clip(displacement / top, 0, 1)).astype(np.uint8)
     parallax[~measured] //= 2
+    _write(parallax, f"displacement 0 (blue) to {top:.0f} px (red); dark: filled in")
     return np.hstack([canvas, parallax])
+
+
+def _write(canvas: UInt8, text: str) -> None:
+    place, font = (8, canvas.shape[0] - 10), cv2.FONT_HERSHEY_SIMPLEX
+    for colour, width in (((0, 0, 0), 3), ((235, 235, 235), 1)):
+        cv2.putText(canvas, text, place, font, 0.4, colour, width, cv2.LINE_AA)
 
 
 def _dimmed(image: NDArray[np.floating]) -> UInt8:

@@ -8,6 +8,7 @@ all of them.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +43,7 @@ _LEAST_GROUP = 3
 _LOWEST_KEY = np.int16(-32000)
 
 
-@dataclass(frozen=True)
-class Keyed:
+class Keyed(NamedTuple):
     """A frame made ready for either reading.
 
     Attributes:
@@ -141,13 +141,17 @@ class RobustPlates:
 
     def __init__(self, levels: Int16, noise: NoiseModel) -> None:
         """Args: the lit levels of the first reading, (H, W), and the take's noise."""
-        values = np.maximum(from_keys(levels).astype(np.float32), 0)
+        unsampled = levels == _LOWEST_KEY
+        values = np.maximum(np.nan_to_num(from_keys(levels).astype(np.float32), posinf=65504), 0)
         self._sigma_at = _key_sigma(noise)
         sigma = self._sigma_at(values)
         middle = levels - _THIRD_HIGHEST * sigma
         self._lit_low = _to_int16(middle - _LIT * sigma)
         self._lit_high = _to_int16(middle + _LIT * sigma)
         self._dark = _to_int16(middle - _DARK * sigma)
+        # Of a pixel that no sample showed, whatever frame does is taken.
+        self._lit_low[unsampled], self._lit_high[unsampled] = -32767, 32767
+        self._dark[unsampled] = -32768
         pixels = levels.size
         self._shape = levels.shape
         self._total = np.zeros((*levels.shape, 3), np.int32)

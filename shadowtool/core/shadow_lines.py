@@ -20,6 +20,8 @@ _LARGEST_STEP = 8
 _LEAST_POINTS = 12
 # Root mean square distance of the points from their middle, along the line, pixels.
 _LEAST_SPREAD = 4.0
+# A fit tries this many lines through two points, and keeps the points this near, pixels.
+_HYPOTHESES, _NEAR = 200, 2.0
 # A line is poor if its residual is this many times the pass's median, and larger than the floor.
 _POOR_RATIO, _POOR_FLOOR = 2.5, 0.5
 # A direction jumps if it is this many times the pass's median deviation off its neighbours'
@@ -194,11 +196,27 @@ class _Line:
 
 
 def _fit(points: Float64) -> _Line | None:
-    """Total least squares: the normal is the direction in which the points spread least."""
+    """Total least squares over the points that the best of many lines through two of them has
+    near it: the plane has specks, and shade of its own."""
+    rng = np.random.default_rng(len(points))
+    one, other = points[rng.integers(0, len(points), (2, _HYPOTHESES))]
+    along = other - one
+    length = np.hypot(along[:, 0], along[:, 1])
+    usable = length > _LEAST_SPREAD
+    if usable.any():
+        one, along, length = one[usable], along[usable], length[usable]
+        normal = np.stack([-along[:, 1], along[:, 0]], axis=-1) / length[:, None]
+        distance = np.abs(points @ normal.T - (one * normal).sum(axis=-1))
+        # Not a count with a sharp bound but how near the near ones are.
+        score = np.maximum(1 - (distance / _NEAR) ** 2, 0).sum(axis=0)
+        points = points[distance[:, int(np.argmax(score))] <= _NEAR]
+    if len(points) < _LEAST_POINTS:
+        return None
     middle = points.mean(axis=0)
     centred = points - middle
     spread = centred.T @ centred / len(points)
     values, vectors = np.linalg.eigh(spread)
+    # The normal is the direction in which the points spread least.
     if values[1] < _LEAST_SPREAD**2:
         return None
     normal = vectors[:, 0]
@@ -255,8 +273,9 @@ def _jumping(fits: dict[int, _Line], frames: Float64) -> set[int]:
     deviation = np.zeros(len(order))
     for k in range(len(order)):
         near = [j for j in range(max(k - 2, 0), min(k + 3, len(order))) if j != k]
-        rates = (angle[near] - angle[k]) / (at[near] - at[k])
-        slope = np.median(rates)
+        # The course is the neighbours' own, after Theil and Sen; the suspect has no say in it.
+        pairs = [(i, j) for i in near for j in near if i < j]
+        slope = np.median([(angle[j] - angle[i]) / (at[j] - at[i]) for i, j in pairs])
         expected = np.median(angle[near] - slope * (at[near] - at[k]))
         deviation[k] = abs(angle[k] - expected)
     limit = max(_JUMP_RATIO * float(np.median(deviation)), _JUMP_FLOOR)

@@ -10,6 +10,9 @@ from shadowtool.core.noise import NoiseModel, extreme_range
 Float32 = NDArray[np.float32]
 
 # Rec.709 luminance.
+# Less than this part of the usual contrast is that of a pixel in shade.
+_SHADE = 0.4
+
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
@@ -64,6 +67,26 @@ def least_contrast(highest: Float32, frames: int, noise: NoiseModel) -> Float32:
     return np.asarray(sigma * np.maximum(extreme_range(frames), 8), np.float32)
 
 
+def without_shade(times: ShadowTimes, highest: Float32, plane: NDArray[np.bool_]) -> ShadowTimes:
+    """Times without the pixels that the key light never reaches.
+
+    In shade of its own a pixel still loses some sky to the stick, at another time than it would
+    lose the key light: its contrast is a small part of its brightness. How large a part it is in
+    the light is seen on the reference plane.
+
+    Args:
+        highest: (H, W), I_max.
+        plane: (H, W), the reference plane region.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        part = times.contrast / highest
+    usual = part[plane & np.isfinite(times.time)]
+    if not usual.size:
+        return times
+    shade = part < _SHADE * np.median(usual)
+    return ShadowTimes(np.where(shade, np.float32(np.nan), times.time), times.contrast)
+
+
 class CrossingTimes:
     """Finds the first crossing of the half-way threshold, frame by frame, in constant memory.
 
@@ -82,12 +105,19 @@ class CrossingTimes:
         self._before_frame = 0.0
 
     def add(self, frame: float, gray: Float32) -> None:
-        """Take in one frame's luminance, (H, W), in the order of the pass."""
+        """Take in one frame's luminance, (H, W), in the order of the pass.
+
+        Where it isn't finite the last value that was stands.
+        """
+        finite = np.isfinite(gray)
+        if not finite.all():
+            before = np.full_like(gray, np.nan) if self._before is None else self._before
+            gray = np.where(finite, gray, before)
         with np.errstate(invalid="ignore"):
             below = self._open & (gray < self._threshold)
         if self._before is not None and below.any():
             before, now = self._before[below], gray[below]
-            with np.errstate(invalid="ignore", divide="ignore"):
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
                 part = (before - self._threshold[below]) / (before - now)
             self._time[below] = self._before_frame + part * (frame - self._before_frame)
         self._open &= ~below

@@ -19,6 +19,7 @@ Float64 = NDArray[np.float64]
 LEAST_ANGLE = np.radians(10.0)
 # A time read off whole frames is uniformly distributed over one: its standard deviation.
 _FRAME_SIGMA = 1 / np.sqrt(12)
+_LEAST_WEIGHT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,9 @@ def intersect(passes: list[Pass]) -> WarpMap:
     # standard deviation, whose inverse is q's covariance.
     weighted = np.zeros((5, *shape))
     information = np.zeros((3, *shape))
-    angle_low = np.full(shape, np.inf)
+    least_cosine = np.full(shape, np.inf)
     normals = []
+    best = min(float(scan.lines.residual.min()) for scan in passes)
     for scan in passes:
         known = np.isfinite(scan.times.time)
         lines = interpolate_lines(scan.lines, scan.times.time[known].astype(np.float64))
@@ -80,7 +82,9 @@ def intersect(passes: list[Pass]) -> WarpMap:
         known[known] = spans
         nx, ny = lines.normal[spans].T
         d, residual = lines.offset[spans], lines.residual[spans]
-        weight = scan.times.contrast[known].astype(np.float64) ** 2 * np.exp(-(residual**2))
+        # Only the weights' ratios matter; a floor keeps the worst line from counting as none.
+        fit = np.maximum(np.exp(best**2 - residual**2), _LEAST_WEIGHT)
+        weight = scan.times.contrast[known].astype(np.float64) ** 2 * fit
         for row, term in zip(weighted, (nx * nx, nx * ny, ny * ny, nx * d, ny * d), strict=True):
             row[known] += weight * term
         speed = np.interp(lines.frame[spans], scan.lines.frame, line_speed(scan.lines, shape))
@@ -94,8 +98,8 @@ def intersect(passes: list[Pass]) -> WarpMap:
     for i, one in enumerate(normals):
         for other in normals[i + 1 :]:
             cosine = np.abs((one * other).sum(axis=-1))
-            angle_low = np.fmin(angle_low, cosine)
-    known = angle_low <= np.cos(LEAST_ANGLE)
+            least_cosine = np.fmin(least_cosine, cosine)
+    known = least_cosine <= np.cos(LEAST_ANGLE)
     a, b, c, e, f = weighted
     warp = np.full((*shape, 2), np.nan, np.float32)
     error = np.full(shape, np.inf, np.float32)

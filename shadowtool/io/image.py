@@ -126,7 +126,10 @@ class Image:
         """
         for name in names:
             with contextlib.suppress(InputError):
-                return self.channel(name)
+                values = self.channel(name)
+                # Paint programs add an opaque alpha, which says nothing of what was painted.
+                if name != "A" or len(names) == 1 or np.ptp(values) > 0 or values.shape == (1, 1):
+                    return values
         only = list(self.layers.values())
         if len(only) == 1 and only[0].ndim == 2:
             return _unit(only[0])

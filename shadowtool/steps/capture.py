@@ -1,5 +1,6 @@
 """Footage from a movie, a sequence or a camera to numbered linear frames, and what it is worth."""
 
+import itertools
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -43,9 +44,8 @@ _MOVED = 0.25
 # Neighbouring frames this much more alike than those around are the same picture twice.
 _DOUBLED = 0.05
 _GRID = 8
-# Integer code values from here on are clipped; floating point has no top but 1 is where most
-# cameras' files end.
-_CLIPPED_CODE = 0.999
+# Integer code values from here on are clipped; floating point ends only where halfs do.
+_CLIPPED_CODE, _LARGEST_HALF = 0.999, 65504.0
 # The part of the record that is shown when the step is done.
 _FIGURES = ("transfer", "bits", "frame_rate", "camera_motion", "clipped", "dropped", "doubled")
 
@@ -173,7 +173,7 @@ class _Report:
     def add(self, measured: _Measured) -> None:
         frame, seconds = measured.arriving.frame, measured.arriving.seconds
         self.noise.add(measured.linear)
-        grid = np.nan_to_num(measured.linear[::_GRID, ::_GRID])
+        grid = np.clip(np.nan_to_num(measured.linear[::_GRID, ::_GRID]), -1e4, 1e4)
         if self.before is not None:
             self.likeness.append((frame, float(np.abs(grid - self.before).mean())))
         self.before = grid
@@ -196,8 +196,11 @@ class _Report:
         """Frames before which at least one is missing by the clock."""
         if rate is None:
             return []
-        pairs = zip(self.seconds, self.seconds[1:], strict=False)
-        return [now[0] for before, now in pairs if (now[1] - before[1]) * float(rate) > 1.5]
+        late = []
+        for (before, then), (frame, now) in itertools.pairwise(self.seconds):
+            if (now - then) * float(rate) - float(frame - before) > 0.5:
+                late.append(frame)
+        return late
 
 
 @dataclass(frozen=True)
@@ -276,7 +279,7 @@ class _Taking:
                 write_png(path, to_code(linear), provenance)
         gray = camera_motion.prepare(luminance(linear))
         shift = None if reference is None else camera_motion.shift(reference, gray, self.size[0])
-        top = 1.0 if self.source.bits is None else _CLIPPED_CODE
+        top = _LARGEST_HALF if self.source.bits is None else _CLIPPED_CODE
         return _Measured(arriving, linear, shift, float((loaded.values >= top).any(axis=-1).mean()))
 
     def _linear(self, coded: NDArray[np.floating]) -> Float32:
@@ -361,7 +364,7 @@ def _record(
         "camera_motion": {
             "largest": None if most is None else round(measured[most], 4),
             "largest_at": most,
-            "moved_at": moved,
+            "moved_at": "never" if moved is None else moved,
             "unmeasured": len(report.shifts) - len(measured),
         },
     }
@@ -380,7 +383,7 @@ def _warn(record: dict[str, Any], strict: bool, output: Path) -> None:
     if record["clipped"] > 0.001:
         logger.warning("%s: %.1f%% of the pixels are clipped", output, 100 * record["clipped"])
     motion = record["camera_motion"]
-    if motion["moved_at"] is not None:
+    if motion["moved_at"] != "never":
         message = (
             f"{record['input']}: the camera moved, first seen in frame {motion['moved_at']}, by up"
             f" to {motion['largest']:.2f} pixels in frame {motion['largest_at']};"

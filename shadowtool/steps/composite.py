@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 from shadowtool.choices import Fill, Format
 from shadowtool.core.beta import inpaint
 from shadowtool.core.compositing import over, shade, shadow_ratio
+from shadowtool.core.filling import fill_membrane
 from shadowtool.core.warp_map import WarpMap, resample
 from shadowtool.errors import InputError
 from shadowtool.io.image import (
     EXR,
     PNG,
-    read_header,
     read_image,
     to_code,
     to_half,
     write_exr,
     write_png,
 )
-from shadowtool.io.products import read_plates, read_warp
+from shadowtool.io.products import WARP, read_plates, read_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_frames, require_size
 from shadowtool.steps.matte import BETA_FOLDER, FIGURE_FOLDER
@@ -71,6 +71,7 @@ def composite(
     warp_map: WarpMap | None = None
     shared = [stored.fingerprint]
     if warp is not None:
+        warp = warp / WARP if warp.is_dir() else warp
         warp_map, warp_header, mark = read_warp(warp)
         require_size(warp, warp_header, header, f"the plates in {plates}")
         shared.append(mark)
@@ -78,15 +79,18 @@ def composite(
     name = output.resolve().name
     recipe = Recipe(
         "composite",
-        {"fill": fill, "format": file_format, "ratio": ratio, "warped": warp is not None},
+        {"fill": fill, "format": file_format, "ratio": ratio},
         {
-            "foreground": Path(figure_frames.pattern).name,
-            "beta": Path(beta_frames.pattern).name,
-            "plates": plates.resolve().name,
-        },
+            "--fg": Path(figure_frames.pattern).name,
+            "--beta-frames": Path(beta_frames.pattern).name,
+            "--plates": plates.resolve().name,
+        }
+        | ({} if warp is None else {"--warp": warp.name}),
     )
     if repaired:
-        logger.warning("%s: %d pixels are unknown in a plate; the other serves", plates, repaired)
+        logger.warning(
+            "%s: %d pixels of the plates are unknown and continued from around", plates, repaired
+        )
 
     def products(frame: Frame) -> list[Path]:
         files = [output / frame_file(name, frame, suffix)]
@@ -99,15 +103,19 @@ def composite(
 
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
         visibility, unknown = _visibility(beta_frames, frame, fill)
-        colour, alpha = read_image(figure_frames.path(frame)).rgba()
+        figure = read_image(figure_frames.path(frame))
+        colour, alpha = figure.rgba()
+        bad = ~(np.isfinite(colour).all(axis=-1) & np.isfinite(alpha))
+        alpha = np.clip(np.where(bad, np.float32(0), alpha), 0, 1)
+        colour = np.where(bad[..., None], np.float32(0), colour)
         if warp_map is not None:
             visibility = resample(visibility, warp_map.warp, outside=1.0)
         shaded = shade(lit, shadow, visibility)
         result = over(colour, alpha, shaded)
-        figures = {"unknown": unknown}
+        figures = {"unknown": unknown, "not_finite": int(bad.sum())}
         marked = with_figures(provenance, figures)
         target, *ratios = products(frame)
-        frame_header = read_header(figure_frames.path(frame))
+        frame_header = figure.header
         if suffix == EXR:
             write_exr(target, {"RGB": to_half(result)}, frame_header, marked)
         else:
@@ -118,7 +126,8 @@ def composite(
         return figures
 
     def summary(rows: list[Figures]) -> Figures:
-        return {"unknown": sum(int(row.get("unknown", 0)) for row in rows)}
+        names = ("unknown", "not_finite")
+        return {name: sum(int(row.get(name, 0)) for row in rows) for name in names}
 
     work = FrameWork(recipe, output, products, sources, shared, make)
     return work.run(frames, run, absent, summary)
@@ -153,10 +162,13 @@ def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, 
 
 
 def _complete(lit: Float32, shadow: Float32) -> tuple[Float32, Float32, int]:
-    """Plates without NaN: where one is unknown the other stands in, black where both are."""
-    holes = ~(np.isfinite(lit) & np.isfinite(shadow)).all(axis=-1)
+    """Plates without NaN: where one is unknown, both are continued from around."""
+    holes = np.asarray(~(np.isfinite(lit) & np.isfinite(shadow)).all(axis=-1))
     if not holes.any():
         return lit, shadow, 0
-    either = np.where(np.isfinite(lit), lit, np.where(np.isfinite(shadow), shadow, np.float32(0)))
-    whole_shadow = np.where(np.isfinite(shadow), shadow, either)
-    return either, whole_shadow, int(holes.sum())
+    known = (~holes).astype(np.float32)
+    whole = [
+        fill_membrane(np.where(holes[..., np.newaxis], np.float32(0), p), known)
+        for p in (lit, shadow)
+    ]
+    return whole[0], whole[1], int(holes.sum())

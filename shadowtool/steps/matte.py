@@ -1,5 +1,6 @@
 """The shadow matte β and the figure's matte, frame by frame."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +8,11 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Fill, Only
 from shadowtool.core import beta as shadow_beta
+from shadowtool.core.color_line import background_distance
 from shadowtool.core.compositing import shade
 from shadowtool.core.matting import (
     difference_alpha,
     difference_trimap,
-    line_distance,
     pull_figure,
 )
 from shadowtool.errors import OptionError
@@ -21,7 +22,14 @@ from shadowtool.io.sequence import Frame, frame_file, open_sequence
 from shadowtool.steps.footage import open_footage, require_frames, require_size
 from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
 
+logger = logging.getLogger(__name__)
+
 Float32 = NDArray[np.float32]
+
+# How exact plates are, as a part of their value.
+_TOLERANCE = 0.015
+# A figure larger than this part of the picture is none.
+_TOO_MUCH = 0.5
 
 TRIMAP_FOLDER, FIGURE_FOLDER, BETA_FOLDER = "trimap", "fg", "beta"
 
@@ -82,8 +90,8 @@ def matte(
             "noise": [[float(v) for v in row] for row in (noise.slope, noise.floor)],
         },
         {"frames": Path(footage.sequence.pattern).name}
-        | {"plates": plates.resolve().name}
-        | {role: Path(sequence.pattern).name for role, sequence in given.items()},
+        | {"--plates": plates.resolve().name}
+        | {f"--{role}": Path(sequence.pattern).name for role, sequence in given.items()},
     )
 
     def wanted(product: Only) -> bool:
@@ -116,7 +124,7 @@ def matte(
         if "alpha" in given:
             coverage = np.clip(_matte_plane(given["alpha"].path(frame)), 0, 1)
         else:
-            distance = line_distance(image, scene, noise)
+            distance = background_distance(image, scene.lit, scene.shadow, noise, _TOLERANCE)
             if "trimap" in given:
                 regions = _trimap_plane(given["trimap"].path(frame))
             else:
@@ -152,10 +160,20 @@ def matte(
 
     def summary(rows: list[Figures]) -> Figures:
         names = ("unknown", "hidden", "not_finite")
-        return {name: sum(int(row.get(name, 0)) for row in rows) for name in names}
+        pixels = max(len(rows), 1) * footage.header.width * footage.header.height
+        return {
+            name: round(sum(int(row.get(name, 0)) for row in rows) / pixels, 5) for name in names
+        }
 
     work = FrameWork(recipe, output, products, sources, [stored.fingerprint], make)
-    return work.run(frames, run, absent, summary)
+    result = work.run(frames, run, absent, summary)
+    if result.figures.get("hidden", 0) > _TOO_MUCH:
+        logger.warning(
+            "%s: %.0f%% of the picture is taken for the figure; are these the plates of this take?",
+            output,
+            100 * result.figures["hidden"],
+        )
+    return result
 
 
 def _matte_plane(path: Path) -> Float32:
@@ -164,7 +182,7 @@ def _matte_plane(path: Path) -> Float32:
 
 
 def _trimap_plane(path: Path) -> NDArray[np.uint8]:
-    plane = _matte_plane(path)
+    plane = np.nan_to_num(read_image(path).plane("Y", "G"))
     trimap = np.full(plane.shape, 128, np.uint8)
     trimap[plane < 0.25] = 0
     trimap[plane > 0.75] = 255

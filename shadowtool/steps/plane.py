@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.errors import OptionError
+from shadowtool.io.files import is_file
 from shadowtool.io.image import Header, read_image
 from shadowtool.steps.footage import require_size
 
@@ -30,6 +31,8 @@ def read_plane(plane: str, header: Header) -> tuple[NDArray[np.bool_], str]:
         corners = np.rint(np.clip(points, -1e6, 1e6)).astype(np.int32)
         cv2.fillPoly(region, [corners], 255)
         name = " ".join(words)
+    elif not words or (re.fullmatch(r"[-\d.,\s]+", plane) and not is_file(Path(plane))):
+        raise OptionError(f"--plane {plane!r}: neither a mask image nor a polygon x,y x,y x,y ...")
     else:
         image = read_image(Path(plane))
         require_size(image.path, image.header, header, "the footage")

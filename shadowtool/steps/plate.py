@@ -1,7 +1,7 @@
 """Lit and shadow plates from a take in which a shadow moves over the scene."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -11,15 +11,23 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Estimator, Missing
 from shadowtool.core.beta import shadow_contrast
+from shadowtool.core.holdout import (
+    Background,
+    figure_mask,
+    find_background,
+    full_size,
+    grid_step,
+    on_grid,
+)
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.partial_coverage import complete_shadow
 from shadowtool.core.plates import ExtremePlates, Plates
 from shadowtool.core.robust_plates import SAMPLES, Keyed, LitLevels, RobustPlates, keyed
 from shadowtool.errors import DamagedFileError, InputError
-from shadowtool.io.files import fingerprint_file, make_folder
-from shadowtool.io.image import Image, read_image
+from shadowtool.io.files import fingerprint_file, is_file, new_folders
+from shadowtool.io.image import PNG, Image, read_image, write_png
 from shadowtool.io.products import MANIFEST, plate_files, write_plates
-from shadowtool.io.sequence import Frame, Sequence, open_sequence
+from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import Footage, open_footage, require_frames, require_size
 from shadowtool.steps.plane import read_plane
@@ -37,24 +45,27 @@ logger = logging.getLogger(__name__)
 
 Bool = NDArray[np.bool_]
 
+HOLDOUT_FOLDER = "holdout"
+
 
 def plate(
     source: str | Path,
     output: Path,
     *,
     run: Run = Run(),
-    holdout: str | Path | None = None,
+    holdout: str | Path = "auto",
     estimator: Estimator = "robust",
     plane: str | None = None,
     transfer: str = "auto",
 ) -> Result:
     """Write ``lit.exr``, ``shadow.exr`` and ``confidence.exr``.
 
-    Memory does not depend on the number of frames. ``minmax`` reads each once; ``robust`` reads a
-    fixed number of them once more.
+    Memory does not depend on the number of frames. All are read once, and a fixed number of them
+    once more, before that.
 
     Args:
-        holdout: a matte, roto or trimap sequence; where it is above 0 the pixel is out.
+        holdout: a matte, roto or trimap sequence; where it is above 0 the pixel is out. "auto"
+            finds what isn't background and writes it to ``holdout/``, "none" leaves nothing out.
         plane: mask image or polygon of the plane that the shadow falls on, for ``robust``.
 
     Raises:
@@ -63,29 +74,46 @@ def plate(
     """
     footage = open_footage(source, "frames", transfer, run.missing)
     frames, absent = footage.sequence.select(run.frames, run.missing)
-    held = None if holdout is None else _open_holdout(holdout, frames, footage, run.missing)
-    region, plane_mark = (None, "") if plane is None else read_plane(plane, footage.header)
-    refuse_existing([*plate_files(output), output / MANIFEST], run)
-    inputs = {"frames": Path(footage.sequence.pattern).name}
-    if held is not None:
-        inputs["holdout"] = Path(held.pattern).name
-    recipe = Recipe(
-        "plate",
-        {"estimator": estimator, "transfer": footage.transfer, "plane": plane_mark or None},
-        inputs,
+    automatic = holdout == "auto"
+    held = (
+        None
+        if holdout in ("auto", "none")
+        else _open_holdout(holdout, frames, footage, run.missing)
     )
-    take = _Take(footage, held, run)
+    region, plane_mark = (None, "") if plane is None else read_plane(plane, footage.header)
+
+    def place(frame: Frame) -> Path:
+        return output / HOLDOUT_FOLDER / frame_file(HOLDOUT_FOLDER, frame, PNG)
+
+    written = [place(frame) for frame in frames] if automatic else []
+    refuse_existing([*plate_files(output), output / MANIFEST, *written], run)
+    inputs = {"frames": Path(footage.sequence.pattern).name}
+    parameters = {
+        "estimator": estimator,
+        "transfer": footage.transfer,
+        "plane": plane_mark or None,
+        "holdout": Path(held.pattern).name if held is not None else str(holdout),
+    }
+    recipe = Recipe("plate", parameters, inputs)
     if run.resume:
         paths = [footage.sequence.path(f) for f in frames]
-        paths += [] if held is None else [held.path(f) for f in frames]
-        mark = recipe.fingerprint(ordered_map(fingerprint_file, paths, run.jobs))
+        marks = list(ordered_map(fingerprint_file, paths, run.jobs))
+        if held is not None:
+            given = ordered_map(fingerprint_file, [held.path(f) for f in frames], run.jobs)
+            marks = [mark for pair in zip(marks, given, strict=True) for mark in pair]
+        mark = recipe.fingerprint(marks)
         figures = unchanged(output, plate_files(output), mark)
-        if figures is not None:
+        if figures is not None and all(is_file(file) for file in written):
             return Result("plate", output, frames, len(frames), absent, figures)
-    if estimator == "minmax":
-        plates, noise, more = _extremes(take, frames)
-    else:
-        plates, noise, more = _robust(take, frames, region)
+    take = _Take(footage, run, held, place, recipe.provenance(recipe.fingerprint([])))
+    folders = [output, *([output / HOLDOUT_FOLDER] if automatic else [])]
+    with new_folders(folders):
+        if estimator == "minmax":
+            plates, noise, more = _extremes(take, frames, automatic)
+        else:
+            plates, noise, more = _robust(take, frames, automatic, region)
+    if len(take.used) < 2:
+        logger.warning("%s: one frame shows no moving shadow", footage.sequence.pattern)
     contrast = shadow_contrast(plates, noise)
     unseen = int(np.isnan(plates.lit).any(axis=-1).sum())
     figures = {
@@ -95,11 +123,12 @@ def plate(
         "noise_at_mid_grey": [round(float(v), 6) for v in noise.sigma(np.full(3, 0.18))],
         **more,
     }
+    if unseen == contrast.size:
+        raise InputError(f"{footage.sequence.pattern}: the holdout leaves nothing of any frame")
     if unseen:
         part = 100 * unseen / contrast.size
         logger.warning("%s: %d pixels (%.2f%%) were seen in no frame", output, unseen, part)
-    mark = recipe.fingerprint([*take.marks, *take.held_marks])
-    make_folder(output)
+    mark = recipe.fingerprint(take.marks)
     write_plates(output, plates, contrast, footage.header, recipe.provenance(mark))
     write_manifest(output, recipe, mark, figures)
     return Result("plate", output, take.used, 0, [*absent, *take.skipped], figures)
@@ -114,102 +143,153 @@ class _Estimate(NamedTuple):
 class _Shown(NamedTuple):
     """A frame and what is to be left out of it."""
 
-    image: Image
     values: NDArray[np.floating]
-    matte: Image | None
-    holdout: NDArray[np.float32] | None
+    holdout: NDArray[np.number] | None
     keyed: Keyed | None
+    marks: list[str]
 
 
 @dataclass
 class _Take:
-    """The frames with their holdouts, read in parallel and handed on in order."""
+    """The frames with their holdouts, read in parallel and handed on in order.
+
+    Attributes:
+        held: a holdout that was given.
+        background: what the automatic one goes by, once it is known; None for none.
+        place: where the automatic one is written, by frame.
+    """
 
     footage: Footage
-    held: Sequence | None
     run: Run
+    held: Sequence | None
+    place: Callable[[Frame], Path]
+    provenance: dict[str, str]
+    background: Background | None = None
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
     marks: list[str] = field(default_factory=list)
-    held_marks: list[str] = field(default_factory=list)
 
-    def shown(self, frames: list[Frame], with_keys: bool) -> Iterator[_Shown | None]:
-        """Each frame in turn, None for those that are skipped."""
+    @property
+    def step(self) -> int:
+        return grid_step(*self.footage.header.size)
+
+    def shown(self, frames: list[Frame], with_keys: bool, keep: bool) -> Iterator[_Shown | None]:
+        """Each frame in turn, None for those that are skipped; ``keep`` the holdouts on disk."""
 
         def read(frame: Frame) -> _Shown | None:
             try:
                 image = self.footage.image(frame)
-                matte = None if self.held is None else self._holdout(self.held.path(frame))
+                values = image.rgb(self.footage.transfer)
+                marks = [image.fingerprint]
+                holdout: NDArray[np.number] | None = None
+                if self.held is not None:
+                    matte = self._given(self.held.path(frame))
+                    marks.append(matte.fingerprint)
+                    holdout = matte.plane("A", "Y", "R")
+                elif self.background is not None:
+                    holdout = self.automatic(values)
+                    if keep:
+                        write_png(self.place(frame), holdout, self.provenance)
             except InputError:
                 if self.run.missing == "skip":
                     return None
                 raise
-            values = image.rgb(self.footage.transfer)
-            holdout = None if matte is None else matte.plane("A", "Y", "R")
-            keys = keyed(values, holdout) if with_keys else None
-            return _Shown(image, values, matte, holdout, keys)
+            return _Shown(values, holdout, keyed(values, holdout) if with_keys else None, marks)
 
         yield from ordered_map(read, frames, self.run.jobs)
 
+    def automatic(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """The automatic holdout of a frame, (H, W) uint8."""
+        assert self.background is not None
+        mask = figure_mask(on_grid(values, self.step), self.background)
+        return full_size(mask, *self.footage.header.size, self.step)
+
     def all_shown(
-        self, frames: list[Frame], with_keys: bool, begun: int = 0
+        self, frames: list[Frame], with_keys: bool, begun: int
     ) -> Iterator[tuple[int, _Shown]]:
         """All the frames that can be read, with their positions; what is used is recorded."""
         total = begun + len(frames)
         self.run.progress(begun, total)
-        for position, item in enumerate(self.shown(frames, with_keys)):
+        for position, item in enumerate(self.shown(frames, with_keys, keep=True)):
             if item is None:
                 self.skipped.append(frames[position])
             else:
                 self.used.append(frames[position])
-                self.marks.append(item.image.fingerprint)
-                if item.matte is not None:
-                    self.held_marks.append(item.matte.fingerprint)
+                self.marks += item.marks
                 yield position, item
             self.run.progress(begun + position + 1, total)
         if not self.used:
             raise DamagedFileError(f"{self.footage.sequence.pattern}: no frame can be read")
 
-    def _holdout(self, path: Path) -> Image:
+    def _given(self, path: Path) -> Image:
         image = read_image(path)
         require_size(path, image.header, self.footage.header, "the footage")
         return image
 
 
-def _extremes(take: _Take, frames: list[Frame]) -> _Estimate:
-    """Eq. (4), in one reading."""
-    extremes = ExtremePlates()
-    samples: dict[int, NDArray[np.float32]] = {}
-    sampled = {position: number for number, position in sample_positions(len(frames)).items()}
-    for position, item in take.all_shown(frames, with_keys=False):
-        extremes.add(item.values, item.holdout)
-        if position in sampled:
-            samples[sampled[position]] = thin(item.values)
-    return _Estimate(extremes.plates(), noise_model(noise_levels(samples)), {})
+@dataclass
+class _Samples:
+    """What a first reading of some of the frames tells: noise, background and lit levels."""
+
+    noise: NoiseModel
+    levels: LitLevels
+    count: int
 
 
-def _robust(take: _Take, frames: list[Frame], region: Bool | None) -> _Estimate:
-    """Means of lit and shaded frames, and the plane's ratio where the shadow fell in part."""
-    sampled = {position: number for number, position in sample_positions(len(frames)).items()}
-    spread = np.linspace(0, len(frames) - 1, max(SAMPLES - len(sampled), 1)).astype(int)
-    positions = sorted({*sampled, *spread.tolist()})
-    levels = LitLevels()
-    samples: dict[int, NDArray[np.float32]] = {}
+def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool) -> _Samples:
+    """Read a few frames; find the automatic holdout's background in them if that is wanted."""
+    pairs = {position: number for number, position in sample_positions(len(frames)).items()}
+    spread = np.linspace(0, len(frames) - 1, SAMPLES).round().astype(int).tolist()
+    positions = sorted({*pairs, *spread} if automatic or with_levels else set(pairs))
     chosen = [frames[position] for position in positions]
-    total = len(positions) + len(frames)
-    for count, item in enumerate(take.shown(chosen, with_keys=True)):
-        take.run.progress(count, total)
-        if item is None or item.keyed is None:
+    thinned: dict[int, NDArray[np.float32]] = {}
+    grids: list[NDArray[np.float32]] = []
+    kept: list[tuple[Keyed, NDArray[np.float32]]] = []
+    for count, item in enumerate(take.shown(chosen, with_levels, keep=False)):
+        take.run.progress(count, len(positions) + len(frames))
+        if item is None:
             continue
-        levels.add(item.keyed)
-        if positions[count] in sampled:
-            samples[sampled[positions[count]]] = thin(item.values)
-    noise = noise_model(noise_levels(samples))
+        if positions[count] in pairs:
+            thinned[pairs[positions[count]]] = thin(item.values)
+        grid = on_grid(item.values, take.step)
+        if positions[count] in spread:
+            grids.append(grid)
+        if item.keyed is not None:
+            # The channels are not needed for the levels.
+            light = Keyed(item.keyed.keys[:0], item.keyed.gray, item.keyed.seen)
+            kept.append((light, grid))
+    noise = noise_model(noise_levels(thinned))
+    if automatic and grids:
+        take.background = find_background(grids, noise)
+    levels = LitLevels()
+    for frame, grid in kept:
+        seen = frame.seen
+        if take.background is not None:
+            mask = figure_mask(grid, take.background)
+            free = full_size(mask, *take.footage.header.size, take.step) == 0
+            seen = free if seen is None else seen & free
+        levels.add(frame._replace(seen=seen))
+    return _Samples(noise, levels, len(positions))
+
+
+def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
+    """Eq. (4), in one reading of all the frames."""
+    sampled = _sample(take, frames, automatic, with_levels=False)
+    extremes = ExtremePlates()
+    for _, item in take.all_shown(frames, with_keys=False, begun=sampled.count):
+        extremes.add(item.values, item.holdout)
+    return _Estimate(extremes.plates(), sampled.noise, {})
+
+
+def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | None) -> _Estimate:
+    """Means of lit and shaded frames, and the plane's ratio where the shadow fell in part."""
+    sampled = _sample(take, frames, automatic, with_levels=True)
+    noise = sampled.noise
     estimate: RobustPlates | None = None
-    for _, item in take.all_shown(frames, with_keys=True, begun=len(positions)):
+    for _, item in take.all_shown(frames, with_keys=True, begun=sampled.count):
         assert item.keyed is not None
         if estimate is None:
-            estimate = RobustPlates(levels.levels(), noise)
+            estimate = RobustPlates(sampled.levels.levels(), noise)
         estimate.add(item.keyed)
     assert estimate is not None
     found = estimate.measured()

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,7 +53,8 @@ class Recipe:
     Attributes:
         step: the step's name.
         parameters: values that JSON can hold; no paths, no number of jobs.
-        inputs: what was read, by role, as a person would name it.
+        inputs: what was read, as a person would name it, by option, or by a word of its own for
+            an argument.
     """
 
     step: str
@@ -61,11 +63,16 @@ class Recipe:
 
     @property
     def command(self) -> str:
-        words = ["shadowtool", self.step, *self.inputs.values()]
+        """How to run the step again, but for -o: names without their folders."""
+        words = ["shadowtool", self.step]
+        for name, value in self.inputs.items():
+            words += [name, value] if name.startswith("--") else [value]
         for name, value in self.parameters.items():
-            if value is not None and not isinstance(value, (dict, list)):
-                words.append(f"--{name}={value}")
-        return " ".join(words)
+            if value is True:
+                words.append(f"--{name}")
+            elif isinstance(value, (str, int, float)) and not isinstance(value, bool):
+                words += [f"--{name}", str(value)]
+        return shlex.join(words)
 
     def fingerprint(self, inputs: Iterable[str]) -> str:
         """Of version, parameters and the fingerprints of what was read."""
@@ -147,6 +154,11 @@ class FrameWork:
             summary: from the figures of all the frames that the manifest knows.
         """
         refuse_existing((file for frame in frames for file in self.products(frame)), run)
+        other = read_record(self.output / MANIFEST).get("step", self.recipe.step)
+        if other != self.recipe.step and not run.overwrite:
+            raise OutputExistsError(
+                f"{self.output / MANIFEST}: is the record of {other}; give another folder"
+            )
         folders = {file.parent for frame in frames for file in self.products(frame)}
         rows: dict[str, Figures] = {}
         skipped, kept = list(absent), 0

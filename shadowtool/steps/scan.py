@@ -16,6 +16,7 @@ from shadowtool.core.shadow_time import (
     ShadowTimes,
     least_contrast,
     luminance,
+    without_shade,
 )
 from shadowtool.core.warp_map import Pass, line_speed
 from shadowtool.errors import DamagedFileError, InputError, ReshootError
@@ -71,7 +72,7 @@ def scan(
     recipe = Recipe(
         "scan",
         {"transfer": footage.transfer},
-        {"frames": Path(footage.sequence.pattern).name, "plane": plane_mark},
+        {"frames": Path(footage.sequence.pattern).name, "--plane": plane_mark},
     )
     if run.resume:
         paths = [footage.sequence.path(frame) for frame in frames]
@@ -80,7 +81,7 @@ def scan(
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
     noise = footage.measure_noise(run.jobs)
-    times, marks, used, first = _times(footage, frames, noise, run)
+    times, marks, used, first = _times(footage, frames, noise, region, run)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
     numbers = np.array([float(frame) for frame in used])
     if numbers[-1] > 2**20:
@@ -106,7 +107,11 @@ def scan(
 
 
 def _times(
-    footage: Footage, frames: list[Frame], noise: NoiseModel, run: Run
+    footage: Footage,
+    frames: list[Frame],
+    noise: NoiseModel,
+    region: NDArray[np.bool_],
+    run: Run,
 ) -> tuple[ShadowTimes, list[str], list[Frame], NDArray[np.floating]]:
     """Two readings of the pass: its range, then its crossings."""
 
@@ -141,7 +146,8 @@ def _times(
             crossings.add(float(frame), item[0])
         run.progress(number, total)
     run.progress(total, total)
-    return crossings.times(), marks, used, footage.read(used[0])
+    times = without_shade(crossings.times(), span.highest, region)
+    return times, marks, used, footage.read(used[0])
 
 
 def _figures(times: ShadowTimes, lines: ShadowLines, frames: list[Frame]) -> Figures:

@@ -160,7 +160,7 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     recipe = Recipe(
         "warp",
         {"outside": outside},
-        {"map": map_file.name, "frames": Path(sequence.pattern).name},
+        {"--map": map_file.name, "--apply": Path(sequence.pattern).name},
     )
 
     def products(frame: Frame) -> list[Path]:

@@ -69,7 +69,7 @@ Vector = tuple[float, float, float]
 # Footage of another version is rendered again.
 VERSION = 1
 SEED = 1983
-SAMPLES = 64
+SAMPLES = 100
 FIRST_FRAME = render.FIRST_FRAME
 WIDTH, HEIGHT = 480, 270
 REFERENCE_STEP = 10
@@ -383,7 +383,7 @@ SHOOTS = {
     ),
     "lamp": Shoot(
         camera=render.Camera((-0.9, -7.7, 4.4), (0.1, -0.3, 0.35), WIDTH, HEIGHT, fov=38.0),
-        light=lamp_light((-3.0, -2.6, 4.2), (0.0, -0.2, 0.0), 0.07, (236.0, 178.0, 112.0)),
+        light=lamp_light((-2.4, -3.4, 4.4), (0.2, 0.2, 0.0), 0.07, (220.0, 166.0, 105.0)),
         sky=((0.13, 0.14, 0.16), (0.09, 0.09, 0.10)),
         source_ground="floorboards",
         target_ground="rug",
@@ -400,7 +400,7 @@ SHOOTS = {
                 100.0, 64, 220, width=0.42, height=1.3, margin=60.0, uneven=0.2, length=17.0
             ),
             "sweep2": render.Sweep(
-                38.0, 64, 230, 0.55, height=1.3, margin=64.0, uneven=0.2, length=17.0, body=True
+                38.0, 72, 230, 0.55, height=1.3, margin=112.0, uneven=0.2, length=17.0, body=True
             ),
             "sweep3": render.Sweep(
                 150.0, 60, 240, width=0.6, height=1.3, margin=60.0, uneven=0.2, length=17.0

@@ -259,9 +259,12 @@ def test_a_polygon_that_makes_no_sense(plane, shot, refused):
     assert f"--plane {plane}" in refused(["scan", shot.sweep1, f"--plane={plane}"], code=2)
 
 
-@pytest.mark.parametrize("plane", ["0,0 10,10 abc", "1 2 3", "", "0;0 5;5 0;5", "nan,0 1,1 2,0"])
-def test_a_plane_that_is_neither_polygon_nor_mask(plane, shot, refused):
-    said = refused(["scan", shot.sweep1, "--plane", plane])
+@pytest.mark.parametrize(
+    ("plane", "code"),
+    [("0,0 10,10 abc", 1), ("1 2 3", 2), ("", 2), ("0;0 5;5 0;5", 1), ("nan,0 1,1 2,0", 1)],
+)
+def test_a_plane_that_is_neither_polygon_nor_mask(plane, code, shot, refused):
+    said = refused(["scan", shot.sweep1, "--plane", plane], code=code)
     assert plane in said
 
 
@@ -514,7 +517,7 @@ def test_running_out_of_memory_is_worth_a_retry(shot, command, tmp_path, monkeyp
         raise MemoryError
 
     monkeypatch.setattr("shadowtool.steps.plate.RobustPlates.add", starved)
-    outcome = command(*shot.arguments("plate"), "-o", tmp_path / "out")
+    outcome = command(*shot.arguments("plate"), "--holdout", "none", "-o", tmp_path / "out")
     assert outcome.code == 75
     assert outcome.err.startswith("shadowtool: error: out of memory")
     assert not (tmp_path / "out").exists()
@@ -526,12 +529,13 @@ def test_a_fault_of_our_own_is_one_line_and_a_traceback_only_on_request(
     def faulty(*args, **kwargs):
         raise ZeroDivisionError("nothing to divide by")
 
-    monkeypatch.setattr("shadowtool.steps.plate.ExtremePlates.add", faulty)
-    outcome = command(*shot.arguments("plate"), "-o", tmp_path / "out")
+    monkeypatch.setattr("shadowtool.steps.plate.RobustPlates.add", faulty)
+    words = [*shot.arguments("plate"), "--holdout", "none", "-o", tmp_path / "out"]
+    outcome = command(*words)
     assert outcome.code == 1
     assert outcome.err.count("\n") == 1
     assert "nothing to divide by" in outcome.err
-    assert "Traceback" in command(*shot.arguments("plate"), "-o", tmp_path / "out", "-v").err
+    assert "Traceback" in command(*words, "-v").err
 
 
 def test_messages_stay_on_one_line_whatever_a_file_is_called(refused, tmp_path):
@@ -624,7 +628,7 @@ def test_a_killed_runs_leftovers_are_gone_after_resuming(long_run, shot):
 def test_a_closed_stdout_pipe_ends_quietly_with_everything_written(shot, tmp_path, tree):
     reading, writing = os.pipe()
     os.close(reading)
-    words = [*shot.arguments("plate"), "-o", tmp_path / "out"]
+    words = [*shot.arguments("plate"), "--holdout", "none", "-o", tmp_path / "out"]
     done = subprocess.run(
         [*PROGRAM, *words], stdout=writing, stderr=subprocess.PIPE, text=True, check=False
     )

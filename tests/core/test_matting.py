@@ -1,21 +1,23 @@
 import numpy as np
 import pytest
 
+from shadowtool.core.color_line import line_distance
 from shadowtool.core.matting import (
     BACKGROUND,
     FIGURE,
     difference_alpha,
     difference_trimap,
-    line_distance,
     pull_figure,
 )
 from shadowtool.core.noise import NoiseModel
-from shadowtool.core.plates import Plates
 from tests.scene import Scene
 
 SCENE = Scene()
-PLATES = Plates(SCENE.lit, SCENE.shadow)
 NOISE = NoiseModel(np.full(3, 4.5e-5), np.full(3, 1e-6))
+
+
+def distance_of(image: np.ndarray) -> np.ndarray:
+    return line_distance(image, SCENE.lit, SCENE.shadow, NOISE, 0.01)
 
 
 def shot(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -29,22 +31,22 @@ def shot(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
 
 def test_background_in_any_shadow_lies_on_the_line() -> None:
     image = SCENE.noisy(SCENE.image(SCENE.disk(80, 45, radius=30, soft=40)), 2)
-    assert np.percentile(line_distance(image, PLATES, NOISE), 99) < 5
+    assert np.percentile(distance_of(image), 99) < 5
 
 
 def test_brighter_than_lit_and_darker_than_shadow_are_off_the_line() -> None:
-    assert (line_distance(SCENE.lit * 1.5, PLATES, NOISE) > 8).all()
-    assert (line_distance(SCENE.shadow * 0.2, PLATES, NOISE) > 8).mean() > 0.99
+    assert (distance_of(SCENE.lit * 1.5) > 8).all()
+    assert (distance_of(SCENE.shadow * 0.2) > 8).mean() > 0.99
 
 
 def test_unknown_plates_say_nothing_of_a_figure() -> None:
-    plates = Plates(np.full_like(SCENE.lit, np.nan), SCENE.shadow)
-    assert (line_distance(SCENE.lit, plates, NOISE) == 0).all()
+    nothing = np.full_like(SCENE.lit, np.nan)
+    assert (line_distance(SCENE.lit, nothing, SCENE.shadow, NOISE, 0.01) == 0).all()
 
 
 def test_the_trimap_is_right_where_it_is_sure() -> None:
     image, alpha = shot()
-    trimap = difference_trimap(line_distance(image, PLATES, NOISE))
+    trimap = difference_trimap(distance_of(image))
     assert (alpha[trimap == FIGURE] > 0.99).all()
     assert (alpha[trimap == BACKGROUND] < 0.01).all()
     assert (trimap == FIGURE).sum() > 0.5 * alpha.sum()
@@ -52,7 +54,7 @@ def test_the_trimap_is_right_where_it_is_sure() -> None:
 
 def test_an_empty_scene_has_no_figure() -> None:
     image = SCENE.noisy(SCENE.image(SCENE.disk(80, 45, radius=20)), 3)
-    distance = line_distance(image, PLATES, NOISE)
+    distance = distance_of(image)
     trimap = difference_trimap(distance)
     assert (trimap == BACKGROUND).all()
     assert (difference_alpha(distance, trimap) == 0).all()
@@ -60,7 +62,7 @@ def test_an_empty_scene_has_no_figure() -> None:
 
 def test_alpha_keeps_what_the_trimap_is_sure_of() -> None:
     image, alpha = shot()
-    distance = line_distance(image, PLATES, NOISE)
+    distance = distance_of(image)
     trimap = difference_trimap(distance)
     found = difference_alpha(distance, trimap)
     assert (found[trimap == FIGURE] == 1).all() and (found[trimap == BACKGROUND] == 0).all()

@@ -49,7 +49,13 @@ def test_noise_that_a_codec_freezes_is_found_between_distant_frames() -> None:
 def test_clean_or_single_frames_have_the_least_noise() -> None:
     still = take(1)
     for shots in (still, still * 5):
-        assert model_of(shots).sigma(np.full(3, 0.5)) == pytest.approx([2e-4] * 3)
+        assert model_of(shots).sigma(np.full(3, 0.5)) == pytest.approx([2e-4] * 3, rel=0.05)
+
+
+def test_rounding_to_code_values_counts_as_noise() -> None:
+    step = 1 / 255
+    coarse = [np.round(shot / step) * step for shot in take(24)]
+    assert model_of(coarse).sigma(np.full(3, 0.02)) == pytest.approx([step / 12**0.5] * 3, rel=0.2)
 
 
 def test_frames_with_nothing_finite_are_passed_over() -> None:

@@ -1,0 +1,222 @@
+"""Keeping the figure out of the plates without any roto.
+
+What a locked-off camera sees of the background lies on the line from S to L through each pixel; a
+figure, for most of its pixels, does not. The lines are found from a sample of the frames on a thin
+grid: L is the value on whose line most of a pixel's samples lie, S is L times the ratio that the
+scene's shadows have in common.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.color_line import line_distance
+from shadowtool.core.noise import NoiseModel
+
+Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+# The grid has about this many columns; so many frames are its samples.
+_COLUMNS = 320
+SAMPLES = 24
+# A sample lies on a line within this many standard deviations, of its noise and this part of its
+# value together.
+_ON_LINE, _TOLERANCE, _CARD_TOLERANCE = 4.0, 0.01, 0.04
+# A take whose shadow darkens more of the picture than this is that of a card waved over a scene.
+_MOST, _SHADED = 0.5, 0.5
+# There a surface's shade is what its darkest samples agree on, within this part of their value.
+_STEADY = 0.25
+# Candidates for L are every so many of a pixel's samples, dark to bright.
+_EVERY = 2
+# A part of the scene in shade that the common ratio does not explain: so many samples at least.
+_LEAST_SHADED = 3
+# Of textured ground a figure hides the texture: its logarithm over that of L scatters by more
+# than this within a few pixels.
+_TEXTURE = 0.12
+# A figure is at least this part of the picture.
+_LEAST_FIGURE = 1 / 4000
+
+
+def grid_step(width: int, height: int) -> int:
+    """Every how many pixels the grid has a point."""
+    return max(1, round(max(width, height) / _COLUMNS))
+
+
+def on_grid(image: NDArray[np.floating], step: int) -> Float32:
+    """The grid's pixels of a frame, (H, W, 3) to (h, w, 3) float32."""
+    return np.ascontiguousarray(image[::step, ::step], np.float32)
+
+
+@dataclass(frozen=True)
+class Background:
+    """Each grid point's line from S to L.
+
+    Attributes:
+        lit, shadow: (h, w, 3) float32.
+        noise: the take's.
+        tolerance: how far off its line background may be besides, as a part of its value.
+    """
+
+    lit: Float32
+    shadow: Float32
+    noise: NoiseModel
+    tolerance: float = _TOLERANCE
+
+
+def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
+    """The background's lines from a sample of the take's frames on the grid.
+
+    Args:
+        samples: frames spread over the take, each (h, w, 3).
+    """
+    stack = np.nan_to_num(np.stack(samples), nan=0.0, posinf=1e4, neginf=0.0)
+    order = np.argsort(stack.sum(axis=-1), axis=0)
+    stack = np.take_along_axis(stack, order[..., None], axis=0)
+    ratio = _common_ratio(stack)
+    lit = _most_supported(stack, ratio, noise)
+    shadow = lit * ratio
+    if _under_a_card(stack, lit):
+        # The card takes some of the sky away with the key light, now more, now less.
+        return Background(lit, _steady_shade(stack, shadow), noise, _CARD_TOLERANCE)
+    return Background(lit, _deeper_shade(stack, lit, shadow, noise), noise)
+
+
+def figure_mask(image: Float32, background: Background) -> Bool:
+    """Where a frame on the grid, (h, w, 3), shows something that is not the background."""
+    lit, shadow, noise = background.lit, background.shadow, background.noise
+    off = (~_on_line(image, lit, shadow, noise, background.tolerance)).astype(np.uint8)
+    # A lone grid point may be noise; a figure is connected, and its holes are its own.
+    support = cv2.boxFilter(off.astype(np.float32), -1, (3, 3))
+    solid = ((off > 0) & (support > 0.4)).astype(np.uint8)
+    solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, _disk(3)).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] >= max(_LEAST_FIGURE * solid.size, 6)
+    large[0] = False
+    solid = large[labels].astype(np.uint8) if count > 1 else np.zeros_like(solid)
+    return np.asarray(cv2.dilate(solid, _disk(2)) > 0)
+
+
+def full_size(mask: Bool, width: int, height: int, step: int) -> UInt8:
+    """A grid's mask for the whole picture: (H, W) uint8, 255 where the figure is."""
+    # The grid's points stand for the pixels around them.
+    wide = cv2.resize(
+        mask.astype(np.uint8) * 255,
+        (mask.shape[1] * step, mask.shape[0] * step),
+        interpolation=cv2.INTER_NEAREST,
+    )
+    if step > 1:
+        wide = np.roll(wide, (-(step // 2), -(step // 2)), axis=(0, 1))
+    return np.ascontiguousarray(wide[:height, :width])
+
+
+def _disk(radius: int) -> UInt8:
+    size = 2 * radius + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
+
+
+def _on_line(
+    image: Float32,
+    lit: Float32,
+    shadow: Float32,
+    noise: NoiseModel,
+    tolerance: float = _TOLERANCE,
+) -> Bool:
+    return np.asarray(line_distance(image, lit, shadow, noise, tolerance) <= _ON_LINE)
+
+
+def _common_ratio(stack: Float32) -> Float32:
+    """S/L, (3,): the most frequent ratio below 1 between a pixel's samples and a brighter one.
+
+    Shadow keeps the ground's texture, so its ratio is the same everywhere; a figure's is not.
+    """
+    gray = np.log(np.maximum(stack.sum(axis=-1), 1e-4))
+    reference = gray[int(0.85 * (len(gray) - 1))]
+    difference = (gray - reference).ravel()
+    dark = (difference > -4) & (difference < -0.25)
+    if dark.sum() < 20:
+        return np.full(3, 0.25, np.float32)
+    counts, edges = np.histogram(difference[dark], bins=150, range=(-4, -0.25))
+    smooth = np.convolve(counts, np.hanning(11), mode="same")
+    peak = int(np.argmax(smooth))
+    centre = (edges[peak] + edges[peak + 1]) / 2
+    members = (np.abs(gray - reference - centre) < 0.1).ravel()
+    top = stack[int(0.85 * (len(stack) - 1))]
+    ratios = (stack / np.maximum(top, 1e-4)).reshape(-1, 3)[members]
+    return np.asarray(np.clip(np.median(ratios, axis=0), 0.01, 0.9), np.float32)
+
+
+def _most_supported(stack: Float32, ratio: Float32, noise: NoiseModel) -> Float32:
+    """For each pixel the sample on whose line, as L, most of the samples lie; of equals the
+    darkest, which has the fewest outliers above it."""
+    best = np.full(stack.shape[1:3], -1, np.int16)
+    lit = stack[-1].copy()
+    for candidate in stack[::-_EVERY]:
+        shadow = candidate * ratio
+        support = np.zeros(best.shape, np.int16)
+        for sample in stack:
+            support += _on_line(sample, candidate, shadow, noise)
+        better = support >= best
+        best[better] = support[better]
+        lit[better] = candidate[better]
+    # The mean of the samples that agree with it is less noisy than the sample.
+    total, count = np.zeros_like(lit), np.zeros(best.shape, np.float32)
+    for sample in stack:
+        near = _on_line(sample, lit, lit * np.float32(0.97), noise)
+        total += np.where(near[..., None], sample, np.float32(0))
+        count += near
+    mean = total / np.maximum(count, 1)[..., None]
+    return np.asarray(np.where(count[..., None] > 0, mean, lit), np.float32)
+
+
+def _under_a_card(stack: Float32, lit: Float32) -> bool:
+    """Whether a shadow came over most of the picture, twice at least."""
+    dark = (stack.sum(axis=-1) < _SHADED * lit.sum(axis=-1)).sum(axis=0) >= 2
+    return bool(dark.mean() > _MOST)
+
+
+def _steady_shade(stack: Float32, shadow: Float32) -> Float32:
+    """S of each surface of a scene under a card: its darkest samples, where they agree.
+
+    Args:
+        stack: samples, dark to bright.
+    """
+    darkest = stack[:_LEAST_SHADED]
+    gray = darkest.sum(axis=-1)
+    agreed = gray[-1] <= (1 + _STEADY) * np.maximum(gray[0], np.float32(1e-4))
+    return np.where(agreed[..., None], darkest.mean(axis=0), shadow).astype(np.float32)
+
+
+def _deeper_shade(stack: Float32, lit: Float32, shadow: Float32, noise: NoiseModel) -> Float32:
+    """S of surfaces that get darker than the common ratio says: steep, glossy, or near a wall.
+
+    They are told from a figure by L's texture, which shade keeps and a figure hides.
+    """
+    gray = stack.sum(axis=-1)
+    total, count = np.zeros_like(lit), np.zeros(lit.shape[:2], np.float32)
+    for sample, value in zip(stack, gray, strict=True):
+        off = ~_on_line(sample, lit, shadow, noise) & (value < lit.sum(axis=-1))
+        total += np.where(off[..., None], sample, np.float32(0))
+        count += off
+    mean = total / np.maximum(count, 1)[..., None]
+    ratio = np.log(np.maximum(mean.sum(axis=-1), 1e-4) / np.maximum(lit.sum(axis=-1), 1e-4))
+    candidate = count >= _LEAST_SHADED
+    weight = cv2.boxFilter(candidate.astype(np.float32), -1, (5, 5), normalize=False)
+    values = np.where(candidate, ratio, np.float32(0)).astype(np.float32)
+    first = cv2.boxFilter(values, -1, (5, 5), normalize=False) / np.maximum(weight, 1)
+    second = cv2.boxFilter(values**2, -1, (5, 5), normalize=False) / np.maximum(weight, 1)
+    smooth = np.sqrt(np.maximum(second - first**2, 0)) < _TEXTURE
+    texture = _texture(lit)
+    # On ground without texture nothing tells shade from a figure: the common ratio stands.
+    shaded = candidate & smooth & (texture > 1.5 * _TEXTURE) & (mean < lit).all(axis=-1)
+    return np.where(shaded[..., None], mean, shadow).astype(np.float32)
+
+
+def _texture(lit: Float32) -> Float32:
+    """Local scatter of log L."""
+    gray = np.log(np.maximum(lit.sum(axis=-1), 1e-4)).astype(np.float32)
+    mean = cv2.boxFilter(gray, -1, (5, 5))
+    scatter = cv2.boxFilter(gray**2, -1, (5, 5)) - mean**2
+    return np.asarray(np.sqrt(np.maximum(scatter, 0)), np.float32)

@@ -24,11 +24,9 @@ _COLUMNS = 320
 SAMPLES = 24
 # A sample lies on a line within this many standard deviations, of its noise and this part of its
 # value together.
-_ON_LINE, _TOLERANCE, _CARD_TOLERANCE = 4.0, 0.01, 0.04
+_ON_LINE, _TOLERANCE = 4.0, 0.01
 # A take whose shadow darkens more of the picture than this is that of a card waved over a scene.
 _MOST, _SHADED = 0.5, 0.5
-# There a surface's shade is what its darkest samples agree on, within this part of their value.
-_STEADY = 0.25
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
 # A part of the scene in shade that the common ratio does not explain: so many samples at least.
@@ -57,20 +55,22 @@ class Background:
     Attributes:
         lit, shadow: (h, w, 3) float32.
         noise: the take's.
-        tolerance: how far off its line background may be besides, as a part of its value.
     """
 
     lit: Float32
     shadow: Float32
     noise: NoiseModel
-    tolerance: float = _TOLERANCE
 
 
-def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
+def find_background(samples: list[Float32], noise: NoiseModel) -> Background | None:
     """The background's lines from a sample of the take's frames on the grid.
 
     Args:
         samples: frames spread over the take, each (h, w, 3).
+
+    Returns:
+        None for a take in which a shadow comes over most of the picture: that is a card waved over
+        a scene whose surfaces have each their own S/L, and nobody is in it.
     """
     stack = np.nan_to_num(np.stack(samples), nan=0.0, posinf=1e4, neginf=0.0)
     order = np.argsort(stack.sum(axis=-1), axis=0)
@@ -79,15 +79,14 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     lit = _most_supported(stack, ratio, noise)
     shadow = lit * ratio
     if _under_a_card(stack, lit):
-        # The card takes some of the sky away with the key light, now more, now less.
-        return Background(lit, _steady_shade(stack, shadow), noise, _CARD_TOLERANCE)
+        return None
     return Background(lit, _deeper_shade(stack, lit, shadow, noise), noise)
 
 
 def figure_mask(image: Float32, background: Background) -> Bool:
     """Where a frame on the grid, (h, w, 3), shows something that is not the background."""
     lit, shadow, noise = background.lit, background.shadow, background.noise
-    off = (~_on_line(image, lit, shadow, noise, background.tolerance)).astype(np.uint8)
+    off = (~_on_line(image, lit, shadow, noise)).astype(np.uint8)
     # A lone grid point may be noise; a figure is connected, and its holes are its own.
     support = cv2.boxFilter(off.astype(np.float32), -1, (3, 3))
     solid = ((off > 0) & (support > 0.4)).astype(np.uint8)
@@ -122,9 +121,8 @@ def _on_line(
     lit: Float32,
     shadow: Float32,
     noise: NoiseModel,
-    tolerance: float = _TOLERANCE,
 ) -> Bool:
-    return np.asarray(line_distance(image, lit, shadow, noise, tolerance) <= _ON_LINE)
+    return np.asarray(line_distance(image, lit, shadow, noise, _TOLERANCE) <= _ON_LINE)
 
 
 def _common_ratio(stack: Float32) -> Float32:
@@ -175,18 +173,6 @@ def _under_a_card(stack: Float32, lit: Float32) -> bool:
     """Whether a shadow came over most of the picture, twice at least."""
     dark = (stack.sum(axis=-1) < _SHADED * lit.sum(axis=-1)).sum(axis=0) >= 2
     return bool(dark.mean() > _MOST)
-
-
-def _steady_shade(stack: Float32, shadow: Float32) -> Float32:
-    """S of each surface of a scene under a card: its darkest samples, where they agree.
-
-    Args:
-        stack: samples, dark to bright.
-    """
-    darkest = stack[:_LEAST_SHADED]
-    gray = darkest.sum(axis=-1)
-    agreed = gray[-1] <= (1 + _STEADY) * np.maximum(gray[0], np.float32(1e-4))
-    return np.where(agreed[..., None], darkest.mean(axis=0), shadow).astype(np.float32)
 
 
 def _deeper_shade(stack: Float32, lit: Float32, shadow: Float32, noise: NoiseModel) -> Float32:

@@ -1,7 +1,7 @@
 """Lit and shadow plates from a take in which a shadow moves over the scene."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -24,7 +24,7 @@ from shadowtool.core.partial_coverage import complete_shadow
 from shadowtool.core.plates import ExtremePlates, Plates
 from shadowtool.core.robust_plates import SAMPLES, Keyed, LitLevels, RobustPlates, keyed
 from shadowtool.errors import DamagedFileError, InputError
-from shadowtool.io.files import fingerprint_file, is_file, new_folders
+from shadowtool.io.files import fingerprint_file, is_file, make_folder, new_folders
 from shadowtool.io.image import PNG, Image, read_image, write_png
 from shadowtool.io.products import MANIFEST, plate_files, write_plates
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
@@ -82,10 +82,7 @@ def plate(
     )
     region, plane_mark = (None, "") if plane is None else read_plane(plane, footage.header)
 
-    def place(frame: Frame) -> Path:
-        return output / HOLDOUT_FOLDER / frame_file(HOLDOUT_FOLDER, frame, PNG)
-
-    written = [place(frame) for frame in frames] if automatic else []
+    written = [_place(output / HOLDOUT_FOLDER, frame) for frame in frames] if automatic else []
     refuse_existing([*plate_files(output), output / MANIFEST, *written], run)
     inputs = {"frames": Path(footage.sequence.pattern).name}
     parameters = {
@@ -103,11 +100,13 @@ def plate(
             marks = [mark for pair in zip(marks, given, strict=True) for mark in pair]
         mark = recipe.fingerprint(marks)
         figures = unchanged(output, plate_files(output), mark)
-        if figures is not None and all(is_file(file) for file in written):
+        kept = written if figures and figures.get("held_out") == HOLDOUT_FOLDER else []
+        if figures is not None and all(is_file(file) for file in kept):
             return Result("plate", output, frames, len(frames), absent, figures)
-    take = _Take(footage, run, held, place, recipe.provenance(recipe.fingerprint([])))
-    folders = [output, *([output / HOLDOUT_FOLDER] if automatic else [])]
-    with new_folders(folders):
+    take = _Take(
+        footage, run, held, output / HOLDOUT_FOLDER, recipe.provenance(recipe.fingerprint([]))
+    )
+    with new_folders([output]):
         if estimator == "minmax":
             plates, noise, more = _extremes(take, frames, automatic)
         else:
@@ -118,6 +117,7 @@ def plate(
     unseen = int(np.isnan(plates.lit).any(axis=-1).sum())
     figures = {
         "frames": len(take.used),
+        "held_out": take.held_out(),
         "pixels": int(contrast.size),
         "unseen": unseen,
         "noise_at_mid_grey": [round(float(v), 6) for v in noise.sigma(np.full(3, 0.18))],
@@ -156,18 +156,24 @@ class _Take:
     Attributes:
         held: a holdout that was given.
         background: what the automatic one goes by, once it is known; None for none.
-        place: where the automatic one is written, by frame.
+        folder: where the automatic one is written.
     """
 
     footage: Footage
     run: Run
     held: Sequence | None
-    place: Callable[[Frame], Path]
+    folder: Path
     provenance: dict[str, str]
     background: Background | None = None
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
     marks: list[str] = field(default_factory=list)
+
+    def held_out(self) -> str:
+        """What was left out, in a word or two."""
+        if self.held is not None:
+            return Path(self.held.pattern).name
+        return "nothing" if self.background is None else HOLDOUT_FOLDER
 
     @property
     def step(self) -> int:
@@ -189,7 +195,7 @@ class _Take:
                 elif self.background is not None:
                     holdout = self.automatic(values)
                     if keep:
-                        write_png(self.place(frame), holdout, self.provenance)
+                        write_png(_place(self.folder, frame), holdout, self.provenance)
             except InputError:
                 if self.run.missing == "skip":
                     return None
@@ -261,6 +267,8 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     noise = noise_model(noise_levels(thinned))
     if automatic and grids:
         take.background = find_background(grids, noise)
+    if take.background is not None:
+        make_folder(take.folder)
     levels = LitLevels()
     for frame, grid in kept:
         seen = frame.seen
@@ -303,6 +311,10 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         "read_as": "a plane that a shadow crossed" if completed.partial else "a scene under a card",
     }
     return _Estimate(plates, noise, figures)
+
+
+def _place(folder: Path, frame: Frame) -> Path:
+    return folder / frame_file(HOLDOUT_FOLDER, frame, PNG)
 
 
 def _open_holdout(

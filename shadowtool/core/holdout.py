@@ -73,10 +73,11 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background | N
         a scene whose surfaces have each their own S/L, and nobody is in it.
     """
     stack = np.nan_to_num(np.stack(samples), nan=0.0, posinf=1e4, neginf=0.0)
+    in_time = list(stack)
     order = np.argsort(stack.sum(axis=-1), axis=0)
     stack = np.take_along_axis(stack, order[..., None], axis=0)
     ratio = _common_ratio(stack)
-    lit = _most_supported(stack, ratio, noise)
+    lit = _most_supported(stack, in_time, ratio, noise)
     shadow = lit * ratio
     if _under_a_card(stack, lit):
         return None
@@ -146,21 +147,32 @@ def _common_ratio(stack: Float32) -> Float32:
     return np.asarray(np.clip(np.median(ratios, axis=0), 0.01, 0.9), np.float32)
 
 
-def _most_supported(stack: Float32, ratio: Float32, noise: NoiseModel) -> Float32:
-    """For each pixel the sample on whose line, as L, most of the samples lie; of equals the
-    darkest, which has the fewest outliers above it."""
-    best = np.full(stack.shape[1:3], -1, np.int16)
+def _most_supported(
+    stack: Float32, in_time: list[Float32], ratio: Float32, noise: NoiseModel
+) -> Float32:
+    """For each pixel the sample on whose line, as L, most of the samples lie.
+
+    That they are spread over the take counts half as much as their number: ground is seen before
+    and after a figure that stops for a while.
+    """
+    best = np.full(stack.shape[1:3], -1, np.float32)
     lit = stack[-1].copy()
     for candidate in stack[::-_EVERY]:
         shadow = candidate * ratio
-        support = np.zeros(best.shape, np.int16)
-        for sample in stack:
-            support += _on_line(sample, candidate, shadow, noise)
-        better = support >= best
-        best[better] = support[better]
+        votes = np.zeros(best.shape, np.float32)
+        first, last = np.full(best.shape, np.inf, np.float32), np.zeros(best.shape, np.float32)
+        for time, sample in enumerate(in_time):
+            vote = _on_line(sample, candidate, shadow, noise)
+            votes += vote
+            np.minimum(first, np.float32(time), out=first, where=vote)
+            np.maximum(last, np.float32(time), out=last, where=vote)
+        score = votes + np.where(votes > 0, last - first, 0) / 2
+        better = score > best
+        best[better] = score[better]
         lit[better] = candidate[better]
+    count = np.zeros(lit.shape[:2], np.float32)
+    total = np.zeros_like(lit)
     # The mean of the samples that agree with it is less noisy than the sample.
-    total, count = np.zeros_like(lit), np.zeros(best.shape, np.float32)
     for sample in stack:
         near = _on_line(sample, lit, lit * np.float32(0.97), noise)
         total += np.where(near[..., None], sample, np.float32(0))

@@ -52,7 +52,7 @@ def shadow_ratio_field(
     if plane is not None:
         firm &= plane
     # What climbs is a penumbra, however long it stood there.
-    level = firm & (_slope(gray) < _SLOPE)
+    level = _opened(firm & (_slope(gray) < _SLOPE))
     if level.sum() < 50:
         return None
     common = _mode(gray[level])
@@ -128,7 +128,7 @@ def complete_shadow(
     brighter, darker = excess >= _ALIKE * spread, excess <= -_ALIKE * spread
     # On the plane only what is level over some area can be a surface of its own.
     surface = dark & firm & (_slope(np.where(dark, gray, np.float32(0))) < _SLOPE)
-    surface = cv2.morphologyEx(surface.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5))) > 0
+    surface = _opened(surface)
     few = np.minimum(frames / np.float32(_FIRM), 1)
     own = np.where(dark, np.float32(1), np.float32(0))
     own = np.where(region & dark & darker, few, own)
@@ -137,6 +137,12 @@ def complete_shadow(
     kept[~dark & ~region] = 1
     mixed = kept[..., None] * result + (1 - kept[..., None]) * expected
     return Completed(np.asarray(mixed, np.float32), np.asarray(own, np.float32), partial)
+
+
+def _opened(mask: Bool) -> Bool:
+    """A mask without what is narrower than a few pixels: noise that looks like a shadow."""
+    small = np.ones((5, 5), np.uint8)
+    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
 
 
 def _log_ratios(lit: Float32, shadow: Float32) -> tuple[Float32, Float32]:

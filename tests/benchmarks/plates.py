@@ -14,9 +14,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from shadowtool.core.beta import shadow_matte
 from shadowtool.core.transfer import encode_srgb
 from shadowtool.io.image import read_image, write_png
 from shadowtool.io.products import read_plates
+from shadowtool.io.sequence import open_sequence
 from shadowtool.steps.capture import capture
 from shadowtool.steps.matte import matte
 from shadowtool.steps.plate import plate
@@ -71,16 +73,24 @@ def beta_figures(
     plate(take, work / "source", run=Run(overwrite=True), **holdout, **options)
     frames = frame_numbers(scene, "source")
     chosen = f"{frames[0]}-{frames[-1]}x3"
-    matte(
-        take,
-        work / "matte",
-        plates=work / "source",
-        alpha=alpha,
-        run=Run(overwrite=True, frames=chosen),
-    )
+    literal = options.get("estimator") == "minmax"
+    scene_plates = read_plates(work / "source").plates
+    if not literal:
+        matte(
+            take,
+            work / "matte",
+            plates=work / "source",
+            alpha=alpha,
+            run=Run(overwrite=True, frames=chosen),
+        )
     near, elsewhere = [], []
     for frame in frames[::3]:
-        found = read_image(work / "matte" / "beta" / f"beta.{frame}.exr").plane("Y")
+        if literal:
+            image = load(frame_file_of(take, frame))
+            projected = shadow_matte(image, scene_plates.lit, scene_plates.shadow)
+            found = np.clip(np.nan_to_num(projected, nan=1.0), 0, 1)
+        else:
+            found = read_image(work / "matte" / "beta" / f"beta.{frame}.exr").plane("Y")
         true, cover = load(truth / f"beta.{frame}.exr"), load(truth / f"alpha.{frame}.exr")
         shaded = (true < 0.98).astype(np.uint8)
         around = cv2.dilate(shaded, np.ones((2 * NEAR + 1, 2 * NEAR + 1))) > 0
@@ -92,6 +102,10 @@ def beta_figures(
         f"β near{suffix}": float(np.concatenate(near).mean()),
         f"β elsewhere{suffix}": float(np.concatenate(elsewhere).mean()),
     }
+
+
+def frame_file_of(take: Path, frame: int) -> Path:
+    return open_sequence(take).path(frame)
 
 
 def alpha_mattes(scene: str, folder: Path) -> Path:

@@ -5,17 +5,21 @@ It imports nothing heavy, so that ``--help`` answers at once.
 
 from typing import Literal, get_args
 
+Beta = Literal["scalar", "rgb"]
 Estimator = Literal["robust", "minmax"]
 Fill = Literal["inpaint", "lit", "none"]
 Format = Literal["exr", "png"]
+Gain = Literal["auto", "none"]
 Missing = Literal["error", "skip"]
 Only = Literal["trimap", "alpha", "beta"]
 TransferName = Literal["auto", "linear", "srgb", "rec709", "none"]
 Progress = Literal["auto", "bar", "plain", "openjd", "none"]
 
+BETAS: tuple[str, ...] = get_args(Beta)
 ESTIMATORS: tuple[str, ...] = get_args(Estimator)
 FILLS: tuple[str, ...] = get_args(Fill)
 FORMATS: tuple[str, ...] = get_args(Format)
+GAINS: tuple[str, ...] = get_args(Gain)
 MISSING: tuple[str, ...] = get_args(Missing)
 ONLY: tuple[str, ...] = get_args(Only)
 TRANSFER_NAMES: tuple[str, ...] = get_args(TransferName)

@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from shadowtool.choices import FILLS, ONLY
-from shadowtool.cli.options import folder_option, step_command, transfer_option
+from shadowtool.choices import BETAS, FILLS, ONLY
+from shadowtool.cli.options import folder_option, gain_option, step_command, transfer_option
 
 
 @click.command()
@@ -16,6 +16,19 @@ from shadowtool.cli.options import folder_option, step_command, transfer_option
 @click.option("--alpha", metavar="FRAMES", help="The figure's matte, used as it is given.")
 @click.option("--only", type=click.Choice(ONLY), help="Write one product and stop.")
 @click.option(
+    "--beta",
+    type=click.Choice(BETAS),
+    default="scalar",
+    show_default=True,
+    help="One β for all channels, or one for each: for coloured glass.",
+)
+@click.option(
+    "--clamp/--no-clamp",
+    default=True,
+    show_default=True,
+    help="Keep β within 0 and 1; caustics are above 1.",
+)
+@click.option(
     "--fill",
     type=click.Choice(FILLS),
     default="inpaint",
@@ -23,6 +36,7 @@ from shadowtool.cli.options import folder_option, step_command, transfer_option
     help="What β becomes where it can't be known. inpaint: small patches and what the figure"
     " hides are continued from around them, regions that no shadow ever reached are lit.",
 )
+@gain_option
 @transfer_option
 @step_command
 def command(source: str, output: Path, **options: Any) -> list[Any]:

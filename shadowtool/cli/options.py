@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import click
 
-from shadowtool.choices import MISSING, PROGRESS, TRANSFER_NAMES
+from shadowtool.choices import GAINS, MISSING, PROGRESS, TRANSFER_NAMES
 from shadowtool.cli.progress import reporter
 from shadowtool.cli.report import report
 
@@ -64,6 +64,16 @@ transfer_option = click.option(
     show_default=True,
     help="How code values stand for light. auto: EXR linear, PNG sRGB, movies as they say or"
     " Rec.709. none: use code values as they are.",
+)
+
+
+gain_option = click.option(
+    "--gain",
+    type=click.Choice(GAINS),
+    default="auto",
+    show_default=True,
+    help="Light that changes over the take. auto: each frame's exposure is found from the pixels"
+    " that agree, taken out and recorded. none: frames are taken as they are.",
 )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from shadowtool.choices import ESTIMATORS
-from shadowtool.cli.options import step_command, transfer_option
+from shadowtool.cli.options import gain_option, step_command, transfer_option
 
 
 @click.command()
@@ -34,6 +34,7 @@ from shadowtool.cli.options import step_command, transfer_option
     help="The plane that the shadow falls on, as for scan. Default: all of the picture if the"
     " shadow reached less than most of it.",
 )
+@gain_option
 @transfer_option
 @step_command
 def command(source: str, output: Path, **options: Any) -> list[Any]:

@@ -43,6 +43,28 @@ def shadow_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> 
     return np.asarray(beta, np.float32)
 
 
+def coloured_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> Float32:
+    """Visibility of the key light in each channel: β = (C - S) / (L - S), for coloured glass and
+    caustics (section 7 of the paper).
+
+    Args:
+        image, lit, shadow: (H, W, 3), linear light.
+
+    Returns:
+        (H, W, 3) float32, not clipped; NaN where L = S in the channel or anything is NaN.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        beta = (image.astype(np.float32, copy=False) - shadow) / (lit - shadow)
+    beta[~np.isfinite(beta)] = np.nan
+    return np.asarray(beta, np.float32)
+
+
+def channel_contrast(plates: Plates, noise: NoiseModel) -> Float32:
+    """`shadow_contrast` for each channel by itself, (H, W, 3) float32 ≥ 0."""
+    sigma = noise.sigma((plates.lit + plates.shadow) / 2)
+    return np.asarray(np.maximum(plates.lit - plates.shadow, 0) / sigma, np.float32)
+
+
 def shadow_contrast(plates: Plates, noise: NoiseModel) -> Float32:
     """How far L and S lie apart, in standard deviations of the noise that β sees there.
 
@@ -85,7 +107,7 @@ def without_noise(beta: Float32, contrast: Float32) -> Float32:
 
     A Wiener filter over a small window: what a pixel's neighbours scatter beyond their noise is
     structure, an edge or a penumbra, and stays; what the noise explains goes. Where neither the
-    pixel nor the window's mean lies below 1 by more than their noise, β is 1.
+    pixel nor the window's mean differs from 1 by more than their noise, β is 1.
 
     Args:
         beta: (H, W) float32, not clipped; NaN unknown, which takes no part.
@@ -106,7 +128,8 @@ def without_noise(beta: Float32, contrast: Float32) -> Float32:
     structure = np.maximum(scatter - noise, 0)
     keep = structure / (structure + 1 / np.maximum(weight, np.float32(1e-12)))
     result = mean + keep * (values - mean)
-    lit = ((1 - mean) * np.sqrt(total) < _SURE) & ((1 - values) * np.sqrt(weight) < _SURE + 1)
+    lit = np.abs(1 - mean) * np.sqrt(total) < _SURE
+    lit &= np.abs(1 - values) * np.sqrt(weight) < _SURE + 1
     result = np.where(lit & (structure < noise * _WINDOW**2), np.float32(1), result)
     return np.where(known, result, beta).astype(np.float32)
 

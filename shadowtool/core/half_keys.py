@@ -58,6 +58,12 @@ def keys_per_unit(values: NDArray[np.floating]) -> Float32:
     return np.asarray(steps, np.float32)
 
 
+def scaled_keys(keys: Int16, factor: float) -> Int16:
+    """Keys of the values times a positive factor."""
+    values = np.clip(from_keys(keys).astype(np.float32) * np.float32(factor), -65504, 65504)
+    return to_keys(np.nan_to_num(values).astype(np.float16))
+
+
 def gray_keys(keys: Int16) -> Int16:
     """One key a pixel, (H, W), of the keys of its three channels (H, W, 3)."""
     gray = keys[..., 1] >> 1

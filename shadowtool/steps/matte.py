@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.choices import Fill, Only
+from shadowtool.choices import Beta, Fill, Gain, Only
 from shadowtool.core import beta as shadow_beta
 from shadowtool.core.color_line import background_distance
 from shadowtool.core.compositing import shade
+from shadowtool.core.exposure import frame_gain, without_gain
+from shadowtool.core.holdout import grid_step, on_grid
 from shadowtool.core.matting import (
     difference_alpha,
     difference_trimap,
@@ -43,7 +45,10 @@ def matte(
     alpha: str | Path | None = None,
     trimap: str | Path | None = None,
     only: Only | None = None,
+    beta: Beta = "scalar",
+    clamp: bool = True,
     fill: Fill = "inpaint",
+    gain: Gain = "auto",
     transfer: str = "auto",
 ) -> Result:
     """Write ``trimap/``, ``fg/`` (αF and α) and ``beta/`` (β and its confidence).
@@ -53,7 +58,10 @@ def matte(
         alpha: the figure's matte from elsewhere, used as given; no trimap is then made.
         trimap: 0, 128, 255 for every frame, used instead of one by difference.
         only: write one of the three products.
+        beta: one β for all channels, or one for each, for coloured light.
+        clamp: keep β within 0 and 1; caustics are above.
         fill: what unknown β becomes.
+        gain: find each frame's exposure against the plates and take it out, or take it as it is.
 
     Raises:
         InputError: frames, plates, mattes are missing or don't fit.
@@ -81,10 +89,18 @@ def matte(
     )
     known_confidence = np.clip(1 - 1 / np.maximum(contrast, 1e-6), 0, 1)
     known_confidence[never_shaded] = 0
+    contrasts = [contrast]
+    if beta == "rgb":
+        contrasts = list(np.moveaxis(shadow_beta.channel_contrast(scene, noise), -1, 0))
+    step = grid_step(*footage.header.size)
+    reference = on_grid(np.nan_to_num(scene.lit), step)
     recipe = Recipe(
         "matte",
         {
+            "beta": beta,
+            "clamp": clamp,
             "fill": fill,
+            "gain": gain,
             "only": only,
             "transfer": footage.transfer,
             "noise": [[float(v) for v in row] for row in (noise.slope, noise.floor)],
@@ -121,6 +137,8 @@ def matte(
         image = stored_frame.rgb(footage.transfer).astype(np.float32)
         bad = ~np.isfinite(image).all(axis=-1)
         image[bad] = np.nan
+        exposure = 1.0 if gain == "none" else frame_gain(on_grid(image, step), reference)
+        image = without_gain(image, exposure).astype(np.float32)
         if "alpha" in given:
             coverage = np.clip(_matte_plane(given["alpha"].path(frame)), 0, 1)
         else:
@@ -135,25 +153,36 @@ def matte(
                 return {}
             coverage = difference_alpha(distance, regions)
         hidden = coverage > 0
-        known = shadow_beta.shadow_matte(image, scene.lit, scene.shadow)
-        known[never_shaded | hidden] = np.nan
-        known = np.clip(shadow_beta.without_noise(known, contrast), 0, 1)
-        unknown = np.isnan(known)
-        filled = shadow_beta.fill_beta(known, never_shaded, hidden, fill)
+        if beta == "rgb":
+            planes = np.moveaxis(shadow_beta.coloured_matte(image, scene.lit, scene.shadow), -1, 0)
+        else:
+            planes = shadow_beta.shadow_matte(image, scene.lit, scene.shadow)[np.newaxis]
+        filled_planes = []
+        unknown = np.zeros(hidden.shape, bool)
+        for plane, own_contrast in zip(planes, contrasts, strict=True):
+            known = np.where(never_shaded | hidden, np.float32(np.nan), plane)
+            known = shadow_beta.without_noise(known, own_contrast)
+            known = np.clip(known, 0, 1) if clamp else known
+            unknown |= np.isnan(known)
+            filled_planes.append(shadow_beta.fill_beta(known, never_shaded, hidden, fill))
+        filled = filled_planes[0] if beta == "scalar" else np.stack(filled_planes, axis=-1)
         figures = {
             "unknown": int((unknown & ~hidden).sum()),
             "hidden": int(hidden.sum()),
             "not_finite": int(bad.sum()),
+            "gain": round(exposure, 6),
         }
         if wanted("alpha"):
-            behind = filled if fill != "none" else shadow_beta.inpaint(filled)
-            figure = pull_figure(image, coverage, shade(scene.lit, scene.shadow, behind))
+            behind = [shadow_beta.inpaint(plane) for plane in filled_planes]
+            shown = shade(scene.lit, scene.shadow, np.stack(behind, axis=-1))
+            figure = pull_figure(image, coverage, shown)
             rgba = np.dstack([figure.foreground, figure.alpha])
             marked = with_figures(provenance, figures)
             write_exr(file(FIGURE_FOLDER, frame), {"RGBA": to_half(rgba)}, header, marked)
         if wanted("beta"):
             confidence = np.where(unknown, np.float32(0), known_confidence)
-            layers = {"Y": to_half(filled), "confidence": to_half(confidence)}
+            name = "Y" if beta == "scalar" else "RGB"
+            layers = {name: to_half(filled), "confidence": to_half(confidence)}
             marked = with_figures(provenance, figures)
             write_exr(file(BETA_FOLDER, frame), layers, header, marked)
         return figures
@@ -161,9 +190,11 @@ def matte(
     def summary(rows: list[Figures]) -> Figures:
         names = ("unknown", "hidden", "not_finite")
         pixels = max(len(rows), 1) * footage.header.width * footage.header.height
-        return {
+        parts: Figures = {
             name: round(sum(int(row.get(name, 0)) for row in rows) / pixels, 5) for name in names
         }
+        gains = [float(row.get("gain", 1)) for row in rows] or [1.0]
+        return parts | {"gain": {"least": min(gains), "most": max(gains)}}
 
     work = FrameWork(recipe, output, products, sources, [stored.fingerprint], make)
     result = work.run(frames, run, absent, summary)

@@ -9,8 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.choices import Estimator, Missing
+from shadowtool.choices import Estimator, Gain, Missing
 from shadowtool.core.beta import shadow_contrast
+from shadowtool.core.exposure import common_reference, frame_gain, without_gain
+from shadowtool.core.half_keys import scaled_keys
 from shadowtool.core.holdout import (
     Background,
     figure_mask,
@@ -46,6 +48,8 @@ logger = logging.getLogger(__name__)
 Bool = NDArray[np.bool_]
 
 HOLDOUT_FOLDER = "holdout"
+# The channels are not needed for the lit levels.
+_NO_KEYS = np.zeros((0, 0, 3), np.int16)
 
 
 def plate(
@@ -56,6 +60,7 @@ def plate(
     holdout: str | Path = "auto",
     estimator: Estimator = "robust",
     plane: str | None = None,
+    gain: Gain = "auto",
     transfer: str = "auto",
 ) -> Result:
     """Write ``lit.exr``, ``shadow.exr`` and ``confidence.exr``.
@@ -66,6 +71,8 @@ def plate(
     Args:
         holdout: a matte, roto or trimap sequence; where it is above 0 the pixel is out. "auto"
             finds what isn't background and writes it to ``holdout/``, "none" leaves nothing out.
+        gain: find each frame's exposure and take it out, or take frames as they are. Always as
+            they are with ``minmax``.
         plane: mask image or polygon of the plane that the shadow falls on, for ``robust``.
 
     Raises:
@@ -89,6 +96,7 @@ def plate(
         "estimator": estimator,
         "transfer": footage.transfer,
         "plane": plane_mark or None,
+        "gain": gain if estimator == "robust" else "none",
         "holdout": Path(held.pattern).name if held is not None else str(holdout),
     }
     recipe = Recipe("plate", parameters, inputs)
@@ -104,7 +112,12 @@ def plate(
         if figures is not None and all(is_file(file) for file in kept):
             return Result("plate", output, frames, len(frames), absent, figures)
     take = _Take(
-        footage, run, held, output / HOLDOUT_FOLDER, recipe.provenance(recipe.fingerprint([]))
+        footage,
+        run,
+        held,
+        parameters["gain"] == "auto",
+        output / HOLDOUT_FOLDER,
+        recipe.provenance(recipe.fingerprint([])),
     )
     with new_folders([output]):
         if estimator == "minmax":
@@ -147,6 +160,7 @@ class _Shown(NamedTuple):
     holdout: NDArray[np.number] | None
     keyed: Keyed | None
     marks: list[str]
+    gain: float
 
 
 @dataclass
@@ -156,15 +170,21 @@ class _Take:
     Attributes:
         held: a holdout that was given.
         background: what the automatic one goes by, once it is known; None for none.
+        level: whether changes of exposure are taken out.
+        reference: what exposure is measured against, on the grid; None until it is known.
+        gains: of the frames that were used, where they are not 1.
         folder: where the automatic one is written.
     """
 
     footage: Footage
     run: Run
     held: Sequence | None
+    level: bool
     folder: Path
     provenance: dict[str, str]
     background: Background | None = None
+    reference: NDArray[np.float32] | None = None
+    gains: dict[str, float] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
     marks: list[str] = field(default_factory=list)
@@ -186,6 +206,10 @@ class _Take:
             try:
                 image = self.footage.image(frame)
                 values = image.rgb(self.footage.transfer)
+                gain = 1.0
+                if self.reference is not None:
+                    gain = frame_gain(on_grid(values, self.step), self.reference)
+                    values = without_gain(values, gain)
                 marks = [image.fingerprint]
                 holdout: NDArray[np.number] | None = None
                 if self.held is not None:
@@ -200,7 +224,9 @@ class _Take:
                 if self.run.missing == "skip":
                     return None
                 raise
-            return _Shown(values, holdout, keyed(values, holdout) if with_keys else None, marks)
+            return _Shown(
+                values, holdout, keyed(values, holdout) if with_keys else None, marks, gain
+            )
 
         yield from ordered_map(read, frames, self.run.jobs)
 
@@ -222,6 +248,8 @@ class _Take:
             else:
                 self.used.append(frames[position])
                 self.marks += item.marks
+                if item.gain != 1:
+                    self.gains[str(frames[position])] = round(item.gain, 6)
                 yield position, item
             self.run.progress(begun + position + 1, total)
         if not self.used:
@@ -251,7 +279,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     thinned: dict[int, NDArray[np.float32]] = {}
     grids: list[NDArray[np.float32]] = []
     kept: list[tuple[Keyed, NDArray[np.float32]]] = []
-    for count, item in enumerate(take.shown(chosen, with_levels, keep=False)):
+    for count, item in enumerate(take.shown(chosen, False, keep=False)):
         take.run.progress(count, len(positions) + len(frames))
         if item is None:
             continue
@@ -260,20 +288,25 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         grid = on_grid(item.values, take.step)
         if positions[count] in spread:
             grids.append(grid)
-        if item.keyed is not None:
-            # The channels are not needed for the levels.
-            light = Keyed(item.keyed.keys[:0], item.keyed.gray, item.keyed.seen)
-            kept.append((light, grid))
+        if with_levels:
+            kept.append((keyed(item.values, item.holdout)._replace(keys=_NO_KEYS), grid))
     noise = noise_model(noise_levels(thinned))
+    gains = [1.0] * len(kept)
+    if take.level and grids:
+        take.reference = common_reference(grids)
+        gains = [frame_gain(grid, take.reference) for _, grid in kept]
+        grids = [g / np.float32(frame_gain(g, take.reference)) for g in grids]
     if automatic and grids:
         take.background = find_background(grids, noise)
     if take.background is not None:
         make_folder(take.folder)
     levels = LitLevels()
-    for frame, grid in kept:
+    for (frame, grid), gain in zip(kept, gains, strict=True):
         seen = frame.seen
+        if gain != 1:
+            frame = frame._replace(gray=scaled_keys(frame.gray, 1 / gain))
         if take.background is not None:
-            mask = figure_mask(grid, take.background)
+            mask = figure_mask(grid / np.float32(gain), take.background)
             free = full_size(mask, *take.footage.header.size, take.step) == 0
             seen = free if seen is None else seen & free
         levels.add(frame._replace(seen=seen))
@@ -306,6 +339,7 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
     plates = Plates(found.lit, completed.shadow, found.lit_frames, found.shadow_frames)
     seen = found.lit_frames > 0
     figures: Figures = {
+        "gains": take.gains,
         "shaded": round(float((found.shadow_frames > 0).mean()), 4),
         "own_evidence": round(float(completed.own[seen].mean()), 4) if seen.any() else 0.0,
         "read_as": "a plane that a shadow crossed" if completed.partial else "a scene under a card",

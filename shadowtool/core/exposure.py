@@ -1,0 +1,58 @@
+"""Light that changes over a take: one gain a frame, found from the pixels that agree."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+# Logarithms of gains further from 0 are shadow, not exposure.
+_WIDEST = 0.35
+# A gain nearer to 1 than this is 1: the picture stays as it is, bit for bit.
+_NOTHING = 0.004
+# At least this part of the pixels must agree.
+_LEAST_PART = 0.05
+
+
+def frame_gain(image: Float32, reference: Float32) -> float:
+    """By how much a frame is brighter than the reference where nothing but exposure changed.
+
+    Ratios of the same surface in the same light agree; those of what a shadow or a figure covers
+    lie elsewhere, or scatter.
+
+    Args:
+        image, reference: (h, w, 3), linear light, the same pixels.
+
+    Returns:
+        The most frequent ratio of the two; 1 if it is next to 1, or nothing agrees.
+    """
+    now, then = image.sum(axis=-1), reference.sum(axis=-1)
+    usable = np.isfinite(now) & np.isfinite(then) & (then > 1e-2) & (now > 0)
+    ratio = np.log(now[usable] / then[usable])
+    near = ratio[np.abs(ratio) < _WIDEST]
+    if near.size < max(_LEAST_PART * usable.sum(), 16):
+        return 1.0
+    counts, edges = np.histogram(near, bins=140, range=(-_WIDEST, _WIDEST))
+    smooth = np.convolve(counts, np.hanning(9), mode="same")
+    peak = int(np.argmax(smooth))
+    centre = (edges[peak] + edges[peak + 1]) / 2
+    gain = float(np.median(near[np.abs(near - centre) < 0.03]))
+    return 1.0 if abs(gain) < _NOTHING else float(np.exp(gain))
+
+
+def common_reference(samples: list[Float32]) -> Float32:
+    """What most of a sample of frames show, with their own gains taken out; (h, w, 3)."""
+    reference = np.median(samples, axis=0)
+    gains = [frame_gain(sample, reference) for sample in samples]
+    level = float(np.median(gains))
+    corrected = [
+        sample * np.float32(level / gain) for sample, gain in zip(samples, gains, strict=True)
+    ]
+    return np.asarray(np.median(corrected, axis=0), np.float32)
+
+
+def without_gain(image: NDArray[np.floating], gain: float) -> NDArray[np.floating]:
+    """The frame as it would be at gain 1; the very same array if it is."""
+    if gain == 1:
+        return image
+    corrected = image.astype(np.float32) * np.float32(1 / gain)
+    return corrected.astype(np.float16) if image.dtype == np.float16 else corrected

@@ -42,13 +42,20 @@ def mean_of_keys(total: NDArray[np.integer], count: NDArray[np.integer]) -> Floa
         total: sums of keys.
         count: of how many each is; NaN comes of none.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = total / count.astype(np.float64)
-    low = np.floor(np.nan_to_num(mean)).astype(np.int16)
-    below = from_keys(low).astype(np.float32)
-    above = from_keys(low + np.int16(1)).astype(np.float32)
-    values = below + (above - below) * (mean - low)
-    return np.where(np.isnan(mean), np.nan, values).astype(np.float32)
+    none = count == 0
+    mean = np.divide(total, np.maximum(count, 1), dtype=np.float64).astype(np.float32)
+    low = np.floor(mean)
+    part = mean - low
+    keys = low.astype(np.int16)
+    below = from_keys(keys).astype(np.float32)
+    keys += np.int16(1)
+    above = from_keys(keys).astype(np.float32)
+    above -= below
+    above *= part
+    below += above
+    if none.any():
+        below[np.broadcast_to(none, below.shape)] = np.nan
+    return below
 
 
 def keys_per_unit(values: NDArray[np.floating]) -> Float32:
@@ -72,8 +79,9 @@ def gray_keys(keys: Int16) -> Int16:
     return np.asarray(gray, np.int16)
 
 
-def all_finite(halfs: NDArray[np.float16]) -> NDArray[np.bool_]:
-    """Where no channel is NaN or infinite, (H, W) for (H, W, 3)."""
+def not_finite(halfs: NDArray[np.float16]) -> NDArray[np.bool_] | None:
+    """Where a channel is NaN or infinite, (H, W) for (H, W, 3); None for nowhere."""
     magnitude = np.ascontiguousarray(halfs).view(np.uint16) & np.uint16(0x7FFF)
-    finite = magnitude < np.uint16(0x7C00)
-    return np.asarray(finite.all(axis=-1), bool)
+    if not magnitude.size or magnitude.max() < 0x7C00:
+        return None
+    return np.asarray((magnitude >= 0x7C00).any(axis=-1), bool)

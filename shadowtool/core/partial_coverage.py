@@ -22,6 +22,8 @@ Bool = NDArray[np.bool_]
 
 # Frames that a pixel's shadow value must rest on to tell what the ratio is.
 _FIRM = 3
+# The ratio is averaged on a grid of every so many pixels.
+_COARSE = 4
 # Log ratios further than this from the common one belong to another surface or to a penumbra.
 _COMMON = 0.45
 # The slope of log(S/L), per pixel, at which a partial shadow is as likely as a surface.
@@ -116,27 +118,27 @@ def complete_shadow(
     if found is None:
         return Completed(measured, np.asarray(dark, np.float32), partial=False)
     field, spread = found
-    expected = field * lit
     _, gray = _log_ratios(lit, shadow)
-    excess = np.nan_to_num(gray - np.log(field).mean(axis=-1), nan=np.inf)
-    # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
-    precision = np.maximum(frames, 1)[..., None] / np.maximum(noise, 1e-6) ** 2
-    prior = 1 / np.maximum(spread * expected, 1e-6) ** 2
-    blend = (precision * measured + prior * expected) / (precision + prior)
-    alike: Bool = np.logical_and(np.abs(excess) < _ALIKE * spread, region)
-    result = np.where(alike[..., None], blend, measured)
+    excess = np.nan_to_num(gray - np.log(field.mean(axis=-1)), nan=np.inf)
+    alike = np.asarray(np.abs(excess) < _ALIKE * spread)
     brighter, darker = excess >= _ALIKE * spread, excess <= -_ALIKE * spread
     # On the plane only what is level over some area can be a surface of its own.
-    surface = dark & firm & (_slope(np.where(dark, gray, np.float32(0))) < _SLOPE)
-    surface = _opened(surface)
-    few = np.minimum(frames / np.float32(_FIRM), 1)
-    own = np.where(dark, np.float32(1), np.float32(0))
-    own = np.where(region & dark & darker, few, own)
+    surface = _opened(dark & firm & (_slope(np.where(dark, gray, np.float32(0))) < _SLOPE))
+    own = dark.astype(np.float32)
+    few = region & dark & darker
+    own[few] = np.minimum(frames[few] / np.float32(_FIRM), 1)
     own[region & brighter & ~surface] = 0
-    kept = own.copy()
-    kept[~dark & ~region] = 1
-    mixed = kept[..., None] * result + (1 - kept[..., None]) * expected
-    return Completed(np.asarray(mixed, np.float32), np.asarray(own, np.float32), partial)
+    result = measured.copy()
+    # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
+    both = alike & region & (own > 0)
+    expected = field[both] * lit[both]
+    precision = frames[both][:, None] / np.maximum(noise[both], 1e-6) ** 2
+    prior = 1 / np.maximum(spread * expected, 1e-6) ** 2
+    result[both] = (precision * measured[both] + prior * expected) / (precision + prior)
+    lacking = (own < 1) & (dark | region)
+    weight = own[lacking][:, None]
+    result[lacking] = weight * result[lacking] + (1 - weight) * field[lacking] * lit[lacking]
+    return Completed(result, np.asarray(own, np.float32), partial)
 
 
 def _opened(mask: Bool) -> Bool:
@@ -175,17 +177,18 @@ def _mode(values: Float32) -> float:
 def _smooth(ratio: Float32, members: Bool) -> Float32:
     """The members' log ratios, averaged over an eighth of the picture, continued everywhere."""
     height, width = members.shape
-    weight = members.astype(np.float32)
-    sigma = max(width, height) / 16
-    total = cv2.GaussianBlur(weight, (0, 0), sigma)
+    # Something this smooth needs no full resolution.
+    small = (max(width // _COARSE, 1), max(height // _COARSE, 1))
     values = np.where(members[..., None], ratio, np.float32(0))
-    mean = cv2.GaussianBlur(values, (0, 0), sigma) / np.maximum(total, np.float32(1e-9))[..., None]
-    firm = total > 0.02
-    if not firm.any():
-        firm = total >= total.max()
-    small = (max(width // 8, 1), max(height // 8, 1))
-    coarse = cv2.resize(np.where(firm[..., None], mean, np.float32(0)), small, interpolation=0)
-    known = cv2.resize(firm.astype(np.float32), small, interpolation=0)
-    filled = fill_membrane(np.asarray(coarse, np.float32), np.asarray(known, np.float32))
+    weight = cv2.resize(members.astype(np.float32), small, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(values, small, interpolation=cv2.INTER_AREA)
+    sigma = max(small) / 16
+    blurred = np.asarray(cv2.GaussianBlur(weight, (0, 0), sigma), np.float32)
+    sums = np.asarray(cv2.GaussianBlur(total, (0, 0), sigma), np.float32)
+    sums = sums.reshape(*blurred.shape, 3)
+    mean = sums / np.maximum(blurred, np.float32(1e-9))[..., None]
+    firm = blurred > min(0.02, float(blurred.max()))
+    firm |= blurred >= blurred.max()
+    filled = fill_membrane(np.asarray(mean, np.float32), firm.astype(np.float32))
     wide = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(np.where(firm[..., None], mean, wide), np.float32)
+    return np.asarray(wide, np.float32).reshape(height, width, 3)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.half_keys import all_finite, from_keys, to_keys
+from shadowtool.core.half_keys import from_keys, not_finite, to_keys
 
 Float32 = NDArray[np.float32]
 
@@ -73,7 +73,7 @@ class ExtremePlates:
             # Halfs and floats in one take: go on in float, which holds every half.
             keys = _values(keys)
             self._lowest, self._highest = _values(self._lowest), _values(self._highest)
-        seen = _seen(image, holdout)
+        seen = seen_pixels(image, holdout)
         if seen is None:
             np.minimum(self._lowest, keys, out=self._lowest)
             np.maximum(self._highest, keys, out=self._highest)
@@ -112,15 +112,15 @@ def _values(keys: NDArray[np.int16] | Float32) -> Float32:
     return keys.astype(np.float32)
 
 
-def _seen(
+def seen_pixels(
     image: NDArray[np.floating], holdout: NDArray[np.number] | None
 ) -> NDArray[np.bool_] | None:
     """Where the frame shows the background, or None for everywhere."""
-    if image.dtype == np.float16:
-        finite = all_finite(image)
-    else:
-        finite = np.asarray(np.isfinite(image).all(axis=-1), bool)
-    seen = None if finite.all() else finite
+    bad = not_finite(image.astype(np.float16, copy=False))
+    if bad is not None and image.dtype != np.float16:
+        # Beyond the halfs' range floats are finite still.
+        bad = np.asarray((~np.isfinite(image)).any(axis=-1))
+    seen = None if bad is None else ~bad
     if holdout is not None:
         # NaN in a matte says nothing in favour of the pixel.
         free = np.asarray(holdout <= 0)

@@ -10,11 +10,11 @@ all of them.
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.half_keys import (
-    all_finite,
     from_keys,
     gray_keys,
     keys_per_unit,
@@ -22,6 +22,7 @@ from shadowtool.core.half_keys import (
     to_keys,
 )
 from shadowtool.core.noise import NoiseModel
+from shadowtool.core.plates import seen_pixels
 
 Float32 = NDArray[np.float32]
 Int16 = NDArray[np.int16]
@@ -62,12 +63,7 @@ def keyed(image: NDArray[np.floating], holdout: NDArray[np.number] | None = None
     pixel is not seen."""
     halfs = image if image.dtype == np.float16 else np.clip(image, -65504, 65504)
     keys = to_keys(halfs.astype(np.float16, copy=False))
-    finite = all_finite(halfs) if image.dtype == np.float16 else np.isfinite(image).all(axis=-1)
-    seen = None if finite.all() else np.asarray(finite, bool)
-    if holdout is not None:
-        free = np.asarray(holdout <= 0)
-        seen = free if seen is None else seen & free
-    return Keyed(keys, gray_keys(keys), seen)
+    return Keyed(keys, gray_keys(keys), seen_pixels(image, holdout))
 
 
 class LitLevels:
@@ -165,11 +161,9 @@ class RobustPlates:
         if frame.seen is not None:
             lit &= frame.seen
             dark &= frame.seen
-        # Most of a frame is lit: adding all and taking the rest away again is quicker.
-        np.add(self._total, frame.keys, out=self._total)
-        rest = np.flatnonzero(~lit)
-        self._total.reshape(-1, 3)[rest] -= frame.keys.reshape(-1, 3)[rest]
-        self._count += lit
+        mask = lit.view(np.uint8)
+        cv2.add(self._total, frame.keys, dst=self._total, mask=mask, dtype=cv2.CV_32S)
+        cv2.add(self._count, mask, dst=self._count, dtype=cv2.CV_32S)
         where = np.flatnonzero(dark)
         self._darken(where, frame.gray.ravel()[where], frame.keys.reshape(-1, 3)[where])
 

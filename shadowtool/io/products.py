@@ -91,22 +91,17 @@ def _plate(folder: Path, name: str) -> Path:
     raise InputError(f"{folder}: has no {name}{EXR}; make the plates with `shadowtool plate`")
 
 
-def write_plates(
-    folder: Path,
-    plates: Plates,
-    contrast: NDArray[np.float32],
-    header: Header,
-    provenance: Provenance,
-) -> None:
-    """Write lit, shadow and confidence (channels contrast, frames, maybe shadow_frames)."""
+def plate_layers(
+    folder: Path, plates: Plates, contrast: NDArray[np.float32]
+) -> dict[Path, dict[str, NDArray[np.float32]]]:
+    """What is to be written for plates: layers by file; lit, shadow and confidence (channels
+    contrast, frames, and shadow_frames for plates that are not extremes)."""
     lit, shadow, confidence = plate_files(folder)
-    write_exr(lit, {"RGB": plates.lit}, header, provenance)
-    write_exr(shadow, {"RGB": plates.shadow}, header, provenance)
     frames = plates.frames if plates.frames is not None else np.zeros(contrast.shape)
     layers = {"contrast": contrast, "frames": frames.astype(np.float32)}
     if plates.shadow_frames is not None:
         layers["shadow_frames"] = plates.shadow_frames.astype(np.float32)
-    write_exr(confidence, layers, header, provenance)
+    return {lit: {"RGB": plates.lit}, shadow: {"RGB": plates.shadow}, confidence: layers}
 
 
 def write_scan(folder: Path, scan: Pass, header: Header, provenance: Provenance) -> None:

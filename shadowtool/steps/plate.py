@@ -27,8 +27,8 @@ from shadowtool.core.plates import ExtremePlates, Plates
 from shadowtool.core.robust_plates import SAMPLES, Keyed, LitLevels, RobustPlates, keyed
 from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.files import fingerprint_file, is_file, make_folder, new_folders
-from shadowtool.io.image import PNG, Image, read_image, write_png
-from shadowtool.io.products import MANIFEST, plate_files, write_plates
+from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
+from shadowtool.io.products import MANIFEST, plate_files, plate_layers
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import Footage, open_footage, require_frames, require_size
@@ -142,7 +142,13 @@ def plate(
         part = 100 * unseen / contrast.size
         logger.warning("%s: %d pixels (%.2f%%) were seen in no frame", output, unseen, part)
     mark = recipe.fingerprint(take.marks)
-    write_plates(output, plates, contrast, footage.header, recipe.provenance(mark))
+    provenance = recipe.provenance(mark)
+
+    def write(item: tuple[Path, dict[str, NDArray[np.float32]]]) -> None:
+        write_exr(item[0], item[1], footage.header, provenance)
+
+    for _ in ordered_map(write, plate_layers(output, plates, contrast).items(), run.jobs):
+        pass
     write_manifest(output, recipe, mark, figures)
     return Result("plate", output, take.used, 0, [*absent, *take.skipped], figures)
 

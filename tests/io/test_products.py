@@ -23,12 +23,12 @@ from shadowtool.io.products import (
     SCAN,
     folder_lock,
     plate_files,
+    plate_layers,
     read_plates,
     read_record,
     read_scan,
     read_warp,
     write_json,
-    write_plates,
     write_scan,
     write_warp,
 )
@@ -36,6 +36,11 @@ from shadowtool.io.products import (
 WIDTH, HEIGHT = 7, 5
 HEADER = Header(WIDTH, HEIGHT)
 MADE = {"version": "1", "command": "shadowtool test", "fingerprint": "f"}
+
+
+def write_plates(folder, plates, contrast, header, provenance):
+    for path, layers in plate_layers(folder, plates, contrast).items():
+        write_exr(path, layers, header, provenance)
 
 
 def random(*shape: int, seed: int = 0) -> np.ndarray:

@@ -1,0 +1,183 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from shadowtool.core.beta import (
+    channel_contrast,
+    coloured_matte,
+    shadow_contrast,
+    shadow_matte,
+    without_noise,
+)
+from shadowtool.core.compositing import shade
+from shadowtool.core.noise import NoiseModel
+from shadowtool.core.plates import Plates
+from tests.scene import Scene, smoothstep
+
+SCENE = Scene(rows=(0, 0), columns=(0, 0))
+PLATES = Plates(SCENE.lit, SCENE.shadow)
+NOISE = NoiseModel(np.full(3, 5e-5), np.full(3, 1e-6))
+CONTRAST = shadow_contrast(PLATES, NOISE)
+# The noise of β in full light: more than half-way, for which the contrast stands.
+SIGMA = 1.4 / CONTRAST
+
+
+def filmed(beta: np.ndarray, seed: int = 0) -> np.ndarray:
+    """β as it is measured in a noisy picture of the scene."""
+    clean = shade(SCENE.lit, SCENE.shadow, beta.astype(np.float32))
+    noise = np.random.default_rng(seed).normal(size=clean.shape) * NOISE.sigma(clean)
+    return shadow_matte((clean + noise).astype(np.float32), SCENE.lit, SCENE.shadow)
+
+
+def disk_beta() -> np.ndarray:
+    return SCENE.disk(70, 45, 20, soft=12)
+
+
+def test_light_becomes_exactly_one() -> None:
+    shape = SCENE.lit.shape[:2]
+    cleared = without_noise(filmed(np.ones(shape)), CONTRAST)
+    assert (cleared == 1).mean() > 0.99
+    around = SCENE.disk(70, 45, 40, soft=1) == 1
+    assert (without_noise(filmed(disk_beta()), CONTRAST)[around] == 1).mean() > 0.99
+
+
+def test_light_that_is_no_exact_one_is_within_the_noise() -> None:
+    cleared = without_noise(filmed(np.ones(SCENE.lit.shape[:2])), CONTRAST)
+    assert (np.abs(cleared - 1) < 5 * SIGMA).all()
+
+
+@pytest.mark.parametrize("level", [0.0, 0.2, 0.5, 0.8])
+def test_shadow_of_any_depth_is_found_without_bias(level: float) -> None:
+    beta = np.full(SCENE.lit.shape[:2], level)
+    found = np.stack([without_noise(filmed(beta, seed), CONTRAST) for seed in range(4)])
+    assert found.mean() == pytest.approx(level, abs=0.001)
+
+
+def test_even_shadow_loses_most_of_its_noise() -> None:
+    beta = np.full(SCENE.lit.shape[:2], 0.4)
+    noisy = filmed(beta)
+    assert np.std(without_noise(noisy, CONTRAST) - 0.4) < np.std(noisy - 0.4) / 2
+
+
+@pytest.mark.parametrize("width", [1, 6, 25])
+def test_edges_and_penumbrae_survive_within_the_noise(width: int) -> None:
+    x = np.arange(SCENE.width)
+    beta = np.tile(smoothstep((x - 60) / width), (SCENE.height, 1))
+    errors = np.stack([without_noise(filmed(beta, seed), CONTRAST) - beta for seed in range(6)])
+    assert np.abs(errors / SIGMA).max() < 6
+    # Over the rows and takes the noise averages out; what is left is the filter's own doing.
+    assert np.abs(errors.mean(axis=(0, 1))).max() < 0.015
+
+
+def test_a_hard_edge_stays_where_it_is() -> None:
+    beta = np.ones(SCENE.lit.shape[:2])
+    beta[:, 70:] = 0
+    cleared = without_noise(filmed(beta), CONTRAST)
+    assert (cleared[:, :70] > 0.8).all() and (cleared[:, 70:] < 0.2).all()
+
+
+def test_what_is_unknown_stays_so_and_does_not_spread() -> None:
+    beta = filmed(disk_beta())
+    beta[30:34, 60:66] = np.nan
+    contrast = CONTRAST.copy()
+    cleared = without_noise(beta, contrast)
+    assert np.array_equal(np.isnan(cleared), np.isnan(beta))
+    contrast[30:34, 60:66] = np.nan
+    assert np.array_equal(without_noise(beta, contrast), cleared, equal_nan=True)
+
+
+def test_a_pixel_without_contrast_takes_no_part() -> None:
+    beta = filmed(disk_beta())
+    contrast = CONTRAST.copy()
+    contrast[40, 70] = 0
+    wild = beta.copy()
+    wild[40, 70] = -50
+    quiet, loud = without_noise(beta, contrast), without_noise(wild, contrast)
+    elsewhere = np.ones(beta.shape, bool)
+    elsewhere[40, 70] = False
+    assert np.array_equal(quiet[elsewhere], loud[elsewhere])
+
+
+def test_nothing_known_and_inputs_are_left_alone() -> None:
+    nothing = np.full((9, 9), np.nan, np.float32)
+    assert np.isnan(without_noise(nothing, np.full((9, 9), 50, np.float32))).all()
+    beta, contrast = filmed(disk_beta()), CONTRAST.copy()
+    before = beta.copy()
+    without_noise(beta, contrast)
+    assert np.array_equal(beta, before) and np.array_equal(contrast, CONTRAST)
+
+
+@pytest.mark.parametrize("size", [1, 3, 12])
+def test_caustics_well_above_the_noise_are_kept(size: int) -> None:
+    beta = np.ones(SCENE.lit.shape[:2])
+    beta[40 : 40 + size, 70 : 70 + size] = 1.4
+    cleared = without_noise(filmed(beta), CONTRAST)
+    spot = cleared[40 : 40 + size, 70 : 70 + size]
+    assert (spot > 1).all()
+    assert (np.abs(spot - 1.4) < 5 * 1.4 * SIGMA[40 : 40 + size, 70 : 70 + size]).all()
+
+
+@given(
+    hnp.arrays(np.float32, (12, 14), elements=st.floats(-1, 2, width=32)),
+    st.floats(5, 200),
+)
+def test_the_result_is_within_the_range_of_what_went_in(beta: np.ndarray, level: float) -> None:
+    cleared = without_noise(beta, np.full(beta.shape, level, np.float32))
+    lowest, highest = min(beta.min(), 1), max(beta.max(), 1)
+    assert cleared.min() >= lowest - 1e-4 and cleared.max() <= highest + 1e-4
+
+
+@given(hnp.arrays(np.float32, (6, 7, 3), elements=st.floats(0, 2, width=32)), st.integers(0, 5))
+def test_a_coloured_matte_of_a_composite_is_the_one_that_went_in(
+    beta: np.ndarray, seed: int
+) -> None:
+    scene = Scene(6, 7, seed, rows=(0, 0), columns=(0, 0))
+    picture = shade(scene.lit, scene.shadow, beta)
+    found = coloured_matte(picture, scene.lit, scene.shadow)
+    assert found == pytest.approx(beta, abs=2e-5)
+    assert shade(scene.lit, scene.shadow, found) == pytest.approx(picture, abs=1e-5)
+
+
+def test_a_coloured_matte_is_exact_at_the_plates_and_is_not_clipped() -> None:
+    assert (coloured_matte(SCENE.lit, SCENE.lit, SCENE.shadow) == 1).all()
+    assert (coloured_matte(SCENE.shadow, SCENE.lit, SCENE.shadow) == 0).all()
+    darker = coloured_matte(SCENE.shadow * np.float32(0.5), SCENE.lit, SCENE.shadow)
+    assert (darker < 0).all()
+
+
+def test_gray_light_has_the_same_matte_in_every_channel() -> None:
+    beta = disk_beta()
+    found = coloured_matte(SCENE.image(beta), SCENE.lit, SCENE.shadow)
+    assert found == pytest.approx(np.repeat(beta[..., None], 3, axis=-1), abs=2e-5)
+
+
+def test_a_channel_without_contrast_is_unknown_by_itself() -> None:
+    shadow, image = SCENE.shadow.copy(), SCENE.lit.copy()
+    shadow[3, 4, 1] = SCENE.lit[3, 4, 1]
+    image[5, 6, 2] = np.nan
+    unknown = np.isnan(coloured_matte(image, SCENE.lit, shadow))
+    assert unknown[3, 4].tolist() == [False, True, False]
+    assert unknown[5, 6].tolist() == [False, False, True]
+    assert unknown.sum() == 2
+
+
+def test_channel_contrast_predicts_the_error_of_each_channel() -> None:
+    half = SCENE.image(np.full(SCENE.lit.shape[:2], 0.5, np.float32))
+    noise = np.random.default_rng(3).normal(size=half.shape) * NOISE.sigma(half)
+    error = coloured_matte(half + noise, SCENE.lit, SCENE.shadow) - 0.5
+    predicted = 1 / channel_contrast(PLATES, NOISE)
+    assert np.std(error / predicted, axis=(0, 1)) == pytest.approx(1, abs=0.03)
+
+
+def test_channels_together_tell_more_than_each_by_itself() -> None:
+    each = channel_contrast(PLATES, NOISE)
+    assert (shadow_contrast(PLATES, NOISE) >= each.min(axis=-1)).all()
+    assert (shadow_contrast(PLATES, NOISE) <= np.sqrt((each**2).sum(axis=-1)) * 1.0001).all()
+
+
+def test_a_channel_brighter_in_shadow_has_no_contrast() -> None:
+    lit, shadow = SCENE.lit.copy(), SCENE.shadow.copy()
+    shadow[..., 2] = lit[..., 2] * 1.1
+    assert (channel_contrast(Plates(lit, shadow), NOISE)[..., 2] == 0).all()

@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shadowtool.core.color_line import background_distance, line_distance
+from shadowtool.core.noise import NoiseModel
+from tests.scene import Scene
+
+SCENE = Scene(20, 30, rows=(0, 0), columns=(0, 0))
+SIGMA = 0.01
+# The same in every channel and at every brightness: distances are those of plain geometry.
+EVEN = NoiseModel(np.zeros(3), np.full(3, SIGMA**2))
+CAMERA = NoiseModel(np.array([4e-5, 5e-5, 8e-5]), np.full(3, 1e-6))
+
+
+def distance(image: np.ndarray, noise: NoiseModel = EVEN, tolerance: float = 0.0) -> np.ndarray:
+    return line_distance(image.astype(np.float32), SCENE.lit, SCENE.shadow, noise, tolerance)
+
+
+def along() -> np.ndarray:
+    """The unit direction from S to L of each pixel."""
+    span = (SCENE.lit - SCENE.shadow).astype(np.float64)
+    return span / np.linalg.norm(span, axis=-1, keepdims=True)
+
+
+def across(seed: int = 0) -> np.ndarray:
+    """A unit direction at right angles to that."""
+    other = np.random.default_rng(seed).normal(size=SCENE.lit.shape)
+    rest = other - (other * along()).sum(axis=-1, keepdims=True) * along()
+    return rest / np.linalg.norm(rest, axis=-1, keepdims=True)
+
+
+@given(st.floats(0, 1))
+def test_what_a_shadow_can_do_is_on_the_line(beta: float) -> None:
+    image = SCENE.image(np.full(SCENE.lit.shape[:2], beta, np.float32))
+    for noise in (EVEN, CAMERA):
+        assert distance(image, noise) == pytest.approx(0, abs=0.01)
+
+
+@given(st.floats(0, 1), st.floats(0.5, 30), st.integers(0, 50))
+def test_off_the_line_the_distance_is_in_deviations(beta: float, far: float, seed: int) -> None:
+    image = SCENE.image(np.full(SCENE.lit.shape[:2], beta, np.float32))
+    found = distance(image + far * SIGMA * across(seed))
+    assert found == pytest.approx(far, rel=0.01, abs=0.01)
+
+
+@given(st.floats(0.5, 30))
+def test_the_line_ends_at_either_plate(far: float) -> None:
+    assert distance(SCENE.lit + far * SIGMA * along()) == pytest.approx(far, rel=0.01)
+    assert distance(SCENE.shadow - far * SIGMA * along()) == pytest.approx(far, rel=0.01)
+
+
+def test_noise_alone_stays_within_its_deviations() -> None:
+    rng = np.random.default_rng(0)
+    clean = SCENE.image(np.full(SCENE.lit.shape[:2], 0.5, np.float32))
+    shots = clean + rng.normal(size=(50, *clean.shape)) * CAMERA.sigma(clean)
+    found = distance(shots, CAMERA)
+    # Two of three directions are at right angles to the line.
+    assert np.mean(found**2) == pytest.approx(2, rel=0.1)
+
+
+def test_channels_with_more_noise_count_less() -> None:
+    noise = NoiseModel(np.zeros(3), np.array([1, 1, 25]) * SIGMA**2)
+    red, blue = SCENE.lit.copy(), SCENE.lit.copy()
+    red[..., 0] += 0.2
+    blue[..., 2] += 0.2
+    assert (distance(red, noise) > distance(blue, noise)).all()
+
+
+def test_tolerance_brings_everything_nearer_to_the_line() -> None:
+    image = SCENE.lit + 10 * SIGMA * across()
+    near, far = distance(image, tolerance=0.05), distance(image)
+    assert (near < far).all() and (near > 0).all()
+
+
+def test_unknown_pixels_are_at_no_distance() -> None:
+    image = SCENE.lit + 10 * SIGMA * across()
+    image[3, 4, 1] = np.nan
+    lit = SCENE.lit.copy()
+    lit[5, 6] = np.nan
+    found = line_distance(image.astype(np.float32), lit, SCENE.shadow, EVEN, 0.01)
+    assert found[3, 4] == 0 and found[5, 6] == 0
+    assert (found > 1).sum() == found.size - 2
+    assert background_distance(image.astype(np.float32), lit, SCENE.shadow, EVEN, 0.01)[3, 4] == 0
+
+
+def test_without_a_shadow_the_line_is_a_point() -> None:
+    image = (SCENE.lit + 7 * SIGMA * along()).astype(np.float32)
+    found = line_distance(image, SCENE.lit, SCENE.lit, EVEN, 0)
+    assert found == pytest.approx(7, rel=0.01)
+
+
+@given(st.floats(0.65, 1))
+def test_background_goes_on_below_the_shadow(part: float) -> None:
+    image = np.float32(part) * SCENE.shadow
+    assert background_distance(image, SCENE.lit, SCENE.shadow, EVEN, 0) == pytest.approx(
+        0, abs=0.01
+    )
+
+
+def test_background_does_not_go_on_to_black_nor_above_lit() -> None:
+    noise = NoiseModel(np.zeros(3), np.full(3, 1e-6))
+    black = np.zeros_like(SCENE.lit)
+    assert (background_distance(black, SCENE.lit, SCENE.shadow, noise, 0.01) > 4).all()
+    bright = 1.3 * SCENE.lit
+    assert (background_distance(bright, SCENE.lit, SCENE.shadow, noise, 0.01) > 4).all()
+
+
+@given(st.integers(0, 50))
+def test_background_is_never_further_than_the_line(seed: int) -> None:
+    image = np.random.default_rng(seed).uniform(0, 1, SCENE.lit.shape).astype(np.float32)
+    found = background_distance(image, SCENE.lit, SCENE.shadow, CAMERA, 0.01)
+    assert (found <= distance(image, CAMERA, 0.01)).all() and (found >= 0).all()

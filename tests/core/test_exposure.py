@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shadowtool.core.exposure import common_reference, frame_gain, without_gain
+from tests.scene import Scene
+
+SCENE = Scene()
+# As large as a third of the picture.
+RADIUS = 39.0
+
+
+def crossed(x: float, y: float, seed: int, radius: float = RADIUS) -> np.ndarray:
+    """The scene with a large shadow and a figure of several colours in it."""
+    image = SCENE.image(SCENE.disk(x, y, radius, soft=8))
+    left = int(np.clip(x - 10, 0, 130))
+    for row, colour in ((20, (0.6, 0.4, 0.3)), (35, (0.7, 0.1, 0.1)), (55, (0.05, 0.05, 0.08))):
+        image[row : row + 20, left : left + 24] = colour
+    return SCENE.noisy(image, seed)
+
+
+@settings(deadline=None)
+@given(
+    st.floats(0.9, 1.1).filter(lambda g: abs(g - 1) > 0.008),
+    st.floats(40, 120),
+    st.floats(30, 60),
+    st.integers(0, 9),
+)
+def test_a_gain_is_found_past_shadow_and_figure(gain: float, x: float, y: float, seed: int) -> None:
+    image = crossed(x, y, seed) * np.float32(gain)
+    assert frame_gain(image, SCENE.lit) == pytest.approx(gain, rel=0.003)
+
+
+@settings(deadline=None)
+@given(st.floats(0.997, 1.003), st.floats(40, 120), st.integers(0, 9))
+def test_a_gain_next_to_one_is_exactly_one(gain: float, x: float, seed: int) -> None:
+    assert frame_gain(crossed(x, 45, seed) * np.float32(gain), SCENE.lit) == 1
+
+
+def test_a_frame_without_a_gain_is_the_same_array() -> None:
+    image = SCENE.lit.copy()
+    assert without_gain(image, 1.0) is image
+    halfs = image.astype(np.float16)
+    assert without_gain(halfs, 1.0) is halfs
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_taking_a_gain_out_keeps_the_type_and_the_input(dtype: type) -> None:
+    brighter = (SCENE.lit * np.float32(1.1)).astype(dtype)
+    before = brighter.copy()
+    corrected = without_gain(brighter, 1.1)
+    assert corrected.dtype == dtype
+    assert corrected == pytest.approx(SCENE.lit, rel=2e-3 if dtype == np.float16 else 1e-5)
+    assert np.array_equal(brighter, before)
+
+
+def test_what_is_unknown_is_passed_over() -> None:
+    image, reference = crossed(80, 45, 0) * np.float32(0.92), SCENE.lit.copy()
+    image[:30] = np.nan
+    image[30:33] = np.inf
+    reference[:, :20] = np.nan
+    assert frame_gain(image, reference) == pytest.approx(0.92, rel=0.003)
+
+
+def test_nothing_to_compare_is_a_gain_of_one() -> None:
+    nothing = np.full_like(SCENE.lit, np.nan)
+    black = np.zeros_like(SCENE.lit)
+    for image, reference in ((nothing, SCENE.lit), (SCENE.lit, nothing), (black, SCENE.lit)):
+        assert frame_gain(image, reference) == 1
+    assert frame_gain(SCENE.lit, black) == 1
+
+
+def test_another_picture_is_no_gain() -> None:
+    slate = np.full_like(SCENE.lit, 8.0)
+    assert frame_gain(slate, SCENE.lit) == 1
+
+
+def test_a_picture_in_which_nothing_agrees_has_no_gain() -> None:
+    rng = np.random.default_rng(4)
+    other = SCENE.lit * np.exp(rng.uniform(-2, 2, (*SCENE.lit.shape[:2], 1))).astype(np.float32)
+    assert frame_gain(other, SCENE.lit) == 1
+
+
+def test_full_shadow_over_most_of_the_picture_is_no_gain() -> None:
+    image = SCENE.noisy(SCENE.image(SCENE.disk(80, 45, 68, soft=6)), 0)
+    assert frame_gain(image, SCENE.lit) == 1
+
+
+def take() -> list[np.ndarray]:
+    """Frames spread over a take in which a shadow and a figure cross the scene."""
+    return [crossed(20 + 5 * i, 40 + i % 3, i, radius=22) for i in range(24)]
+
+
+def test_the_reference_is_what_most_frames_show_without_their_gains() -> None:
+    gains = [1.0 if i % 3 else 0.9 for i in range(24)]
+    samples = [frame * np.float32(gain) for frame, gain in zip(take(), gains, strict=True)]
+    reference = common_reference(samples)
+    assert np.median(reference / SCENE.lit) == pytest.approx(1, abs=0.003)
+    for sample, gain in zip(samples, gains, strict=True):
+        assert frame_gain(sample, reference) == pytest.approx(gain, rel=0.005)
+
+
+def test_a_steady_take_has_a_reference_of_its_own_level() -> None:
+    samples = take()
+    before = [sample.copy() for sample in samples]
+    reference = common_reference(samples)
+    assert np.array_equal(reference, np.median(samples, axis=0).astype(np.float32))
+    assert [frame_gain(sample, reference) for sample in samples] == [1.0] * 24
+    assert all(np.array_equal(s, b) for s, b in zip(samples, before, strict=True))
+
+
+def test_in_a_steady_take_a_shadow_that_most_frames_share_is_no_gain() -> None:
+    samples = [crossed(20 + 5 * i, 45, i) for i in range(24)]
+    reference = common_reference(samples)
+    assert [frame_gain(sample, reference) for sample in samples] == [1.0] * 24
+
+
+def test_a_single_sample_is_its_own_reference() -> None:
+    assert np.array_equal(common_reference([SCENE.lit]), SCENE.lit)

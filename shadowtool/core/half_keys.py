@@ -4,6 +4,7 @@ The bits of a half are a piecewise linear logarithm of it: a step of one is a ch
 thousandth, and 16-bit integers are compared and added many times faster than halfs.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -73,10 +74,12 @@ def scaled_keys(keys: Int16, factor: float) -> Int16:
 
 def gray_keys(keys: Int16) -> Int16:
     """One key a pixel, (H, W), of the keys of its three channels (H, W, 3)."""
-    gray = keys[..., 1] >> 1
-    gray += keys[..., 0] >> 2
-    gray += keys[..., 2] >> 2
-    return np.asarray(gray, np.int16)
+    red, gray, blue = (np.asarray(plane, np.int16) for plane in cv2.split(keys))
+    for plane, shift in ((red, 2), (gray, 1), (blue, 2)):
+        np.right_shift(plane, shift, out=plane)
+    gray += red
+    gray += blue
+    return gray
 
 
 def not_finite(halfs: NDArray[np.float16]) -> NDArray[np.bool_] | None:

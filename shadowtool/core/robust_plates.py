@@ -38,7 +38,7 @@ _THIRD_HIGHEST = 1.2
 # below are in shadow to some degree.
 _LIT, _DARK = 3.5, 5.0
 # A frame belongs to a pixel's darkest group within this many standard deviations of its mean.
-_GROUP = 4.0
+_GROUP, _SHADE = 4.0, 0.25
 # A darkest group of fewer frames than this gives way to the next one, if that is much larger.
 _LEAST_GROUP = 3
 _LOWEST_KEY = np.int16(-32000)
@@ -148,6 +148,9 @@ class RobustPlates:
         # Of a pixel that no sample showed, whatever frame does is taken.
         self._lit_low[unsampled], self._lit_high[unsampled] = -32767, 32767
         self._dark[unsampled] = -32768
+        # The noise of a shadow is that of a fraction of the light; which one hardly matters.
+        shaded = np.maximum(values * np.float32(_SHADE), np.float32(1e-4))
+        self._width = (_GROUP * self._sigma_at(shaded)).ravel()
         pixels = levels.size
         self._shape = levels.shape
         self._total = np.zeros((*levels.shape, 3), np.int32)
@@ -171,7 +174,7 @@ class RobustPlates:
         """Let the darkened pixels of a frame join, found or pass over groups."""
         level = gray.astype(np.float32)
         lowest, backup = self._lowest, self._next
-        width = _GROUP * self._sigma_at(np.maximum(from_keys(gray).astype(np.float32), 0))
+        width = self._width[where]
         fresh = lowest.count[where] == 0
         distance = level - lowest.gray[where]
         joins = ~fresh & (np.abs(distance) <= width)

@@ -106,8 +106,9 @@ def test_a_bird_in_one_or_two_frames_changes_next_to_nothing(
     found = measure(bird(take(), when, colour))
     for name in ("lit", "shadow"):
         error = relative(getattr(found, name), getattr(SCENE, name))[spot]
-        assert abs(error.mean()) < 0.3
-        assert np.sqrt((error**2).mean()) < 1
+        # A lucky bird may hide among the frames of a pixel in a hundred.
+        assert (np.abs(error) < 4).all(axis=-1).mean() >= 0.98
+        assert np.abs(np.median(error)) < 0.3 and np.quantile(np.abs(error), 0.9) < 1
 
 
 @settings(max_examples=8, deadline=None)

@@ -1,0 +1,242 @@
+from collections.abc import Callable
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shadowtool.core.holdout import (
+    SAMPLES,
+    Background,
+    figure_mask,
+    find_background,
+    full_size,
+    grid_step,
+    on_grid,
+)
+from shadowtool.core.noise import NoiseModel
+from tests.scene import Scene, smoothstep
+
+WIDTH, HEIGHT = 240, 135
+FRAMES = 40
+SCENE = Scene(HEIGHT, WIDTH, rows=(0, 0), columns=(0, 0))
+NOISE = NoiseModel(np.full(3, 5e-5), np.full(3, 2e-7))
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+# Head, shirt, trousers, shoes, from the top, as parts of the height.
+MANY = ((0.2, (0.55, 0.33, 0.24)), (0.6, (0.10, 0.35, 0.75)), (0.95, (0.75, 0.7, 0.1)))
+DARK = ((0.2, (0.30, 0.16, 0.10)), (0.6, (0.018, 0.018, 0.022)), (0.95, (0.03, 0.026, 0.024)))
+Walk = Callable[[int], float]
+Clothes = tuple[tuple[float, tuple[float, float, float]], ...]
+
+
+def steadily(frame: int) -> float:
+    return 25 + 190 * frame / (FRAMES - 1)
+
+
+def pausing(frame: int) -> float:
+    """Stands still for a third of the take."""
+    return 25 + 190 * float(np.interp(frame, [0, 13, 27, 39], [0, 0.5, 0.5, 1]))
+
+
+def figure_alpha(x: float) -> np.ndarray:
+    """A figure as tall as half the picture with a soft edge, (H, W)."""
+    distance = np.hypot((COLUMNS - x) / 13, (ROWS - 65) / 36) - 1
+    return 1 - smoothstep(distance * 13 / 1.5 + 0.5)
+
+
+def figure_colour(x: float, clothes: Clothes) -> np.ndarray:
+    """Clothes with folds, (H, W, 3)."""
+    height = (ROWS - 29) / 72
+    colour = np.full((HEIGHT, WIDTH, 3), clothes[-1][1])
+    for part, own in reversed(clothes):
+        colour[height < part] = own
+    folds = 1 + 0.25 * np.sin((COLUMNS - x) / 2) * np.cos(ROWS / 5)
+    return colour * folds[..., None]
+
+
+def shadow_beta(x: float, reach: float = 34) -> np.ndarray:
+    """A slanting shadow that starts at the feet and gets softer with distance."""
+    away = np.clip((ROWS - 88) / 40, 0, 1)
+    distance = np.abs(COLUMNS - (x + reach * away)) - 11
+    beta = smoothstep(distance / (2 + 6 * away) + 0.5)
+    return np.where(ROWS > 88, beta, 1.0)
+
+
+class Shoot:
+    """Frames, α and β of a take."""
+
+    def __init__(
+        self, walk: Walk | None, clothes: Clothes = MANY, shade: np.ndarray | None = None
+    ) -> None:
+        self.frames, self.alphas, self.betas = [], [], []
+        for number in range(FRAMES):
+            x = 25 + 4.8 * number if walk is None else walk(number)
+            beta = shadow_beta(x)
+            if shade is not None:
+                # Another shadow, that moves away for the last quarter of the take.
+                beta = np.minimum(beta, shade if number < 0.7 * FRAMES else 1)
+            image = SCENE.image(beta.astype(np.float32))
+            alpha = np.zeros((HEIGHT, WIDTH)) if walk is None else figure_alpha(x)
+            colour = figure_colour(x, clothes)
+            image = alpha[..., None] * colour + (1 - alpha[..., None]) * image
+            self.frames.append(SCENE.noisy(image, number))
+            self.alphas.append(alpha)
+            self.betas.append(beta)
+        self.samples = [
+            self.frames[i] for i in np.linspace(0, FRAMES - 1, SAMPLES).round().astype(int)
+        ]
+
+    def background(self) -> Background:
+        found = find_background(self.samples, NOISE)
+        assert found is not None
+        return found
+
+    def masks(self) -> list[np.ndarray]:
+        background = self.background()
+        return [figure_mask(frame, background) for frame in self.frames]
+
+
+@cache
+def shoot(name: str) -> Shoot:
+    takes = {
+        "walking": lambda: Shoot(steadily),
+        "pausing": lambda: Shoot(pausing),
+        "dark clothes": lambda: Shoot(steadily, DARK, shade=dark_half()),
+        "shade in most frames": lambda: Shoot(steadily, shade=lasting_shade()),
+        "empty": lambda: Shoot(None),
+    }
+    return takes[name]()
+
+
+def lasting_shade() -> np.ndarray:
+    return smoothstep((np.hypot(COLUMNS - 190, ROWS - 105) - 22) / 5 + 0.5)
+
+
+def dark_half() -> np.ndarray:
+    """Shade that the figure walks through."""
+    return smoothstep((np.abs(COLUMNS - 130) - 25) / 4 + 0.5)
+
+
+TAKES = ["walking", "pausing", "dark clothes", "shade in most frames"]
+
+
+@pytest.mark.parametrize("name", TAKES)
+def test_nearly_all_of_the_figure_is_held_out_of_every_frame(name: str) -> None:
+    take = shoot(name)
+    for mask, alpha in zip(take.masks(), take.alphas, strict=True):
+        assert mask[alpha > 0.5].mean() >= 0.98
+
+
+@pytest.mark.parametrize("name", TAKES)
+def test_little_else_is_held_out(name: str) -> None:
+    take = shoot(name)
+    around = np.ones((15, 15), np.uint8)
+    held_light, held_shade = [], []
+    for mask, alpha, beta in zip(take.masks(), take.alphas, take.betas, strict=True):
+        away = cv2.dilate((alpha > 0).astype(np.uint8), around) == 0
+        held_light.append(mask[away & (beta == 1)].mean())
+        held_shade.append(mask[away & (beta < 0.9)].mean())
+    assert np.mean(held_light) < 0.01
+    assert np.mean(held_shade) < 0.05
+
+
+@pytest.mark.parametrize("name", [*TAKES, "empty"])
+def test_the_lines_are_those_of_the_ground(name: str) -> None:
+    background = shoot(name).background()
+    lit = np.abs(np.log(background.lit / SCENE.lit)).max(axis=-1)
+    assert np.mean(lit < 0.05) > 0.97
+    shadow = np.abs(np.log(background.shadow / SCENE.shadow)).max(axis=-1)
+    assert np.mean(shadow < 0.15) > 0.95
+
+
+def test_a_take_without_a_figure_holds_nothing_out() -> None:
+    assert not any(mask.any() for mask in shoot("empty").masks())
+
+
+def test_a_still_take_holds_nothing_out() -> None:
+    frames = [SCENE.noisy(SCENE.lit, seed) for seed in range(SAMPLES)]
+    background = find_background(frames, NOISE)
+    assert background is not None
+    assert not any(figure_mask(frame, background).any() for frame in frames)
+
+
+def test_under_a_card_there_is_no_background_to_tell() -> None:
+    ratio = np.kron(np.random.default_rng(2).uniform(0.1, 0.4, (9, 16)), np.ones((15, 15)))
+    shadow = SCENE.lit * ratio[..., None].astype(np.float32)
+    frames = []
+    for number in range(SAMPLES):
+        x = -70 + 16 * number
+        beta = smoothstep((np.abs(COLUMNS - x) - 45) / 10)[..., None].astype(np.float32)
+        frames.append(SCENE.noisy(shadow + beta * (SCENE.lit - shadow), number))
+    assert find_background(frames, NOISE) is None
+
+
+def test_unknown_pixels_do_not_spread() -> None:
+    take = shoot("walking")
+    samples = [sample.copy() for sample in take.samples]
+    for sample in samples:
+        sample[10:14, 10:14] = np.nan
+        sample[20, 20] = np.inf
+    background = find_background(samples, NOISE)
+    assert background is not None
+    frame = take.frames[20].copy()
+    frame[10:14, 10:14] = np.nan
+    mask = figure_mask(frame, background)
+    whole = figure_mask(take.frames[20], take.background())
+    assert (mask[30:] == whole[30:]).mean() > 0.995
+
+
+def test_the_same_samples_give_the_same_bits_and_are_left_alone() -> None:
+    take = shoot("walking")
+    before = [sample.copy() for sample in take.samples]
+    one, other = take.background(), take.background()
+    assert one.lit.tobytes() == other.lit.tobytes()
+    assert one.shadow.tobytes() == other.shadow.tobytes()
+    frame = take.frames[7].copy()
+    assert np.array_equal(figure_mask(frame, one), figure_mask(frame, other))
+    assert np.array_equal(frame, take.frames[7])
+    assert all(np.array_equal(s, b) for s, b in zip(take.samples, before, strict=True))
+
+
+def test_a_lone_pixel_is_no_figure() -> None:
+    background = shoot("empty").background()
+    frame = SCENE.noisy(SCENE.lit, 99)
+    frame[60, 100] = 3
+    assert not figure_mask(frame, background).any()
+
+
+@given(st.integers(1, 5000), st.integers(1, 5000))
+def test_the_grid_has_some_three_hundred_points_along_the_longer_side(
+    width: int, height: int
+) -> None:
+    step = grid_step(width, height)
+    assert step >= 1
+    points = -(-max(width, height) // step)
+    assert points <= 480 and (step == 1 or points >= 240)
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9))
+def test_the_grid_is_every_so_many_pixels(width: int, height: int, step: int) -> None:
+    image = np.arange(width * height * 3, dtype=np.float16).reshape(height, width, 3)
+    grid = on_grid(image, step)
+    assert grid.dtype == np.float32 and grid.flags.c_contiguous
+    for y, x in ((0, 0), (grid.shape[0] - 1, grid.shape[1] - 1)):
+        assert np.array_equal(grid[y, x], image[y * step, x * step].astype(np.float32))
+    assert (grid.shape[0] - 1) * step < height <= grid.shape[0] * step
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9), st.integers(0, 9))
+def test_every_pixel_is_held_out_as_its_nearest_grid_point_is(
+    width: int, height: int, step: int, seed: int
+) -> None:
+    shape = on_grid(np.zeros((height, width, 3), np.float32), step).shape[:2]
+    mask = np.random.default_rng(seed).random(shape) < 0.5
+    wide = full_size(mask, width, height, step)
+    assert wide.shape == (height, width) and wide.dtype == np.uint8 and wide.flags.c_contiguous
+    rows, columns = (
+        np.minimum((np.arange(size) + step // 2) // step, points - 1)
+        for size, points in ((height, shape[0]), (width, shape[1]))
+    )
+    assert np.array_equal(wide, np.where(mask[np.ix_(rows, columns)], 255, 0))

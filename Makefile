@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 .DEFAULT_GOAL := sample
-.PHONY: sample test format readme clean
+.PHONY: sample test bench format readme clean
 
 sample: .venv/installed
 	$(MAKE) -C sample_data PATH="$(abspath $(BIN)):$$PATH"
@@ -16,9 +16,18 @@ test: .venv/installed-dev
 	$(BIN)/mypy
 	$(BIN)/pytest
 
+# Rendered scenes with known truth (four minutes each, once), and how near we come to it.
+bench: .venv/installed-bench
+	$(BIN)/python -m tests.benchmarks.footage
+	$(BIN)/python -m tests.benchmarks.plates
+
 format: .venv/installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+.venv/installed-bench: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev,sample]"
+	touch $@ .venv/installed-dev .venv/installed
 
 # The README's reference of the commands, from their own --help.
 readme: .venv/installed-dev

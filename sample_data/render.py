@@ -11,8 +11,7 @@ is swept through it three times (``sweep1`` to ``sweep3``). Each of them becomes
 What a shoot cannot deliver is written to ``truth/``: the figure rendered in the target scene
 (``reference``), its coverage (``alpha``), the sun's visibility on the source ground (``beta``), the
 target with the sun and without it (``lit``, ``shadow``) and where every shadow comes from
-(``warp``, an ST map). ``plane.png``, ``roto/`` and ``trimaps/`` stand for what is drawn
-by hand.
+(``warp``, an ST map). ``plane.png`` and ``trimaps/`` stand for what an artist draws by hand.
 
 The parts (camera, key light, figure, hand-held board) do not know each other: a lamp instead of the
 sun is another `KeyLight`, a second board another `Sweep`.
@@ -892,12 +891,6 @@ def trimap(alpha: Array, band: int = 3) -> Array:
     return np.where(inside == 1, 255, np.where(outside == 1, 128, 0)).astype(np.uint8)
 
 
-def garbage_matte(alpha: Array, margin: int = 6) -> Array:
-    """A loose outline, as it is drawn in a minute: 255 within ``margin`` pixels of the figure."""
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
-    return cv2.dilate((alpha > 0.0).astype(np.uint8) * 255, disk)
-
-
 # Files
 
 
@@ -1067,10 +1060,6 @@ def write_drawings(folder: Path) -> None:
     for number in KEYFRAMES:
         alpha = coverage(CAMERA, WALK.figure(number - FIRST_FRAME))
         write_png(folder / "trimaps" / f"trimap.{number}.png", trimap(alpha))
-    frames = takes()["source"][1]
-    for number in range(FIRST_FRAME, FIRST_FRAME + frames):
-        alpha = coverage(CAMERA, WALK.figure(number - FIRST_FRAME), grid=2)
-        write_png(folder / "roto" / f"roto.{number}.png", garbage_matte(alpha))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -36,7 +36,7 @@ def compare_module() -> ModuleType:
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("a shot")
-    for name in ("footage", "roto", "plane.png"):
+    for name in ("footage", "plane.png"):
         (folder / name).symlink_to(SAMPLE / name)
     program = shutil.which("shadowtool", path=str(Path(sys.executable).parent))
     assert program, "the package is not installed"

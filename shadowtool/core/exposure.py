@@ -11,6 +11,9 @@ _WIDEST = 0.35
 _NOTHING = 0.004
 # At least this part of the pixels must agree.
 _LEAST_PART = 0.05
+# Ratios this near to each other agree; the middle of them is closed in on, as penumbrae lie on
+# one side of it.
+_NEAR = (0.03, 0.02, 0.012, 0.008, 0.008)
 
 
 def frame_gain(image: Float32, reference: Float32) -> float:
@@ -35,8 +38,15 @@ def frame_gain(image: Float32, reference: Float32) -> float:
     smooth = np.convolve(counts, np.hanning(9), mode="same")
     peak = int(np.argmax(smooth))
     centre = (edges[peak] + edges[peak + 1]) / 2
-    gain = float(np.median(near[np.abs(near - centre) < 0.03]))
-    return 1.0 if abs(gain) < _NOTHING else float(np.exp(gain))
+    agreed = near[np.abs(near - centre) < _NEAR[0]]
+    for width in _NEAR:
+        members = near[np.abs(near - centre) < width]
+        centre = float(np.median(members)) if members.size else centre
+    # What agrees is many, and many more than if the ratios were anything at all.
+    enough = max(_LEAST_PART * usable.sum(), 2 * near.size * _NEAR[0] / _WIDEST)
+    if agreed.size < enough or abs(centre) < _NOTHING:
+        return 1.0
+    return float(np.exp(centre))
 
 
 def common_reference(samples: list[Float32]) -> Float32:

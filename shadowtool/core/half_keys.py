@@ -50,7 +50,7 @@ def mean_of_keys(total: NDArray[np.integer], count: NDArray[np.integer]) -> Floa
     keys = low.astype(np.int16)
     below = from_keys(keys).astype(np.float32)
     keys += np.int16(1)
-    above = from_keys(keys).astype(np.float32)
+    above = np.minimum(from_keys(keys).astype(np.float32), np.float32(65504))
     above -= below
     above *= part
     below += above
@@ -61,15 +61,10 @@ def mean_of_keys(total: NDArray[np.integer], count: NDArray[np.integer]) -> Floa
 
 def keys_per_unit(values: NDArray[np.floating]) -> Float32:
     """How many keys lie in a change of 1 at these values, float32."""
-    _, exponent = np.frexp(np.abs(values).astype(np.float32))
-    steps = np.ldexp(np.float32(1024), -np.maximum(exponent - 1, _LEAST_EXPONENT))
+    size = np.abs(values).astype(np.float32)
+    _, exponent = np.frexp(np.maximum(size, np.float32(2.0**_LEAST_EXPONENT)))
+    steps = np.ldexp(np.float32(1024), -(exponent - 1))
     return np.asarray(steps, np.float32)
-
-
-def scaled_keys(keys: Int16, factor: float) -> Int16:
-    """Keys of the values times a positive factor."""
-    values = np.clip(from_keys(keys).astype(np.float32) * np.float32(factor), -65504, 65504)
-    return to_keys(np.nan_to_num(values).astype(np.float16))
 
 
 def gray_keys(keys: Int16) -> Int16:

@@ -26,7 +26,7 @@ SAMPLES = 24
 # value together.
 _ON_LINE, _TOLERANCE = 4.0, 0.01
 # A take whose shadow darkens more of the picture than this is that of a card waved over a scene.
-_MOST, _SHADED = 0.5, 0.5
+_MOST, _SHADED, _AT_ONCE = 0.5, 0.5, 0.2
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
 # A part of the scene in shade that the common ratio does not explain: so many samples at least.
@@ -79,7 +79,7 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background | N
     ratio = _common_ratio(stack)
     lit = _most_supported(stack, in_time, ratio, noise)
     shadow = lit * ratio
-    if _under_a_card(stack, lit):
+    if _under_a_card(in_time, lit, shadow, noise):
         return None
     return Background(lit, _deeper_shade(stack, lit, shadow, noise), noise)
 
@@ -101,15 +101,12 @@ def figure_mask(image: Float32, background: Background) -> Bool:
 
 def full_size(mask: Bool, width: int, height: int, step: int) -> UInt8:
     """A grid's mask for the whole picture: (H, W) uint8, 255 where the figure is."""
-    # The grid's points stand for the pixels around them.
-    wide = cv2.resize(
-        mask.astype(np.uint8) * 255,
-        (mask.shape[1] * step, mask.shape[0] * step),
-        interpolation=cv2.INTER_NEAREST,
+    # The grid's points stand for the pixels nearest to them.
+    rows, columns = (
+        np.minimum((np.arange(size) + step // 2) // step, points - 1)
+        for size, points in zip((height, width), mask.shape, strict=True)
     )
-    if step > 1:
-        wide = np.roll(wide, (-(step // 2), -(step // 2)), axis=(0, 1))
-    return np.ascontiguousarray(wide[:height, :width])
+    return np.ascontiguousarray(mask[np.ix_(rows, columns)].astype(np.uint8) * np.uint8(255))
 
 
 def _disk(radius: int) -> UInt8:
@@ -181,10 +178,23 @@ def _most_supported(
     return np.asarray(np.where(count[..., None] > 0, mean, lit), np.float32)
 
 
-def _under_a_card(stack: Float32, lit: Float32) -> bool:
-    """Whether a shadow came over most of the picture, twice at least."""
-    dark = (stack.sum(axis=-1) < _SHADED * lit.sum(axis=-1)).sum(axis=0) >= 2
-    return bool(dark.mean() > _MOST)
+def _under_a_card(in_time: list[Float32], lit: Float32, shadow: Float32, noise: NoiseModel) -> bool:
+    """Whether a shadow came over most of the picture, twice at least.
+
+    It is known by the common ratio, or by darkening much of the picture at once, which dark clothes
+    do not.
+    """
+    dark = np.zeros(lit.shape[:2], np.int32)
+    shaded = np.zeros_like(dark)
+    widest = 0.0
+    for sample in in_time:
+        now = sample.sum(axis=-1) < _SHADED * lit.sum(axis=-1)
+        dark += now
+        shaded += now & _on_line(sample, lit, shadow, noise)
+        widest = max(widest, float(now.mean()))
+    if (shaded >= 2).mean() > _MOST:
+        return True
+    return bool((dark >= 2).mean() > _MOST and widest > _AT_ONCE)
 
 
 def _deeper_shade(stack: Float32, lit: Float32, shadow: Float32, noise: NoiseModel) -> Float32:

@@ -167,7 +167,7 @@ def _slope(gray: Float32) -> Float32:
 
 
 def _mode(values: Float32) -> float:
-    """The most frequent value: the darkest of the peaks that are nearly as high as the highest."""
+    """The most frequent value."""
     counts, edges = np.histogram(values, bins=120, range=(-6.0, 0.5))
     smooth = np.convolve(counts, [1, 2, 3, 2, 1], mode="same")
     peak = int(np.argmax(smooth))

@@ -116,10 +116,11 @@ def seen_pixels(
     image: NDArray[np.floating], holdout: NDArray[np.number] | None
 ) -> NDArray[np.bool_] | None:
     """Where the frame shows the background, or None for everywhere."""
-    bad = not_finite(image.astype(np.float16, copy=False))
-    if bad is not None and image.dtype != np.float16:
-        # Beyond the halfs' range floats are finite still.
-        bad = np.asarray((~np.isfinite(image)).any(axis=-1))
+    if image.dtype == np.float16:
+        bad = not_finite(image.astype(np.float16, copy=False))
+    else:
+        wrong = ~np.isfinite(image)
+        bad = np.asarray(wrong.any(axis=-1)) if wrong.any() else None
     seen = None if bad is None else ~bad
     if holdout is not None:
         # NaN in a matte says nothing in favour of the pixel.

@@ -200,10 +200,18 @@ class RobustPlates:
         count = np.where(stray, backup.count, lowest.count)
         total = np.where(stray[:, None], backup.total, lowest.total)
         shape = self._shape
+        shadow = mean_of_keys(total, count[:, None]).reshape(*shape, 3)
+        lit = mean_of_keys(self._total, self._count[..., None])
+        lit_frames = self._count
+        # Never at its lit level: what it was all the time is all that is known of it.
+        never = (lit_frames == 0) & (count.reshape(shape) > 0)
+        if never.any():
+            lit[never] = shadow[never]
+            lit_frames = np.where(never, count.reshape(shape), lit_frames)
         return Measured(
-            lit=mean_of_keys(self._total, self._count[..., None]),
-            shadow=mean_of_keys(total, count[:, None]).reshape(*shape, 3),
-            lit_frames=self._count.astype(np.uint32),
+            lit=lit,
+            shadow=shadow,
+            lit_frames=lit_frames.astype(np.uint32),
             shadow_frames=count.astype(np.uint32).reshape(shape),
         )
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from shadowtool.choices import Estimator, Gain, Missing
 from shadowtool.core.beta import shadow_contrast
 from shadowtool.core.exposure import common_reference, frame_gain, without_gain
-from shadowtool.core.half_keys import scaled_keys
 from shadowtool.core.holdout import (
     Background,
     figure_mask,
@@ -284,7 +283,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     chosen = [frames[position] for position in positions]
     thinned: dict[int, NDArray[np.float32]] = {}
     grids: list[NDArray[np.float32]] = []
-    kept: list[tuple[Keyed, NDArray[np.float32]]] = []
+    kept: list[tuple[Frame, Keyed, NDArray[np.float32]]] = []
     for count, item in enumerate(take.shown(chosen, False, keep=False)):
         take.run.progress(count, len(positions) + len(frames))
         if item is None:
@@ -295,27 +294,32 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         if positions[count] in spread:
             grids.append(grid)
         if with_levels:
-            kept.append((keyed(item.values, item.holdout)._replace(keys=_NO_KEYS), grid))
+            keys = keyed(item.values, item.holdout)._replace(keys=_NO_KEYS)
+            kept.append((chosen[count], keys, grid))
     noise = noise_model(noise_levels(thinned))
-    gains = [1.0] * len(kept)
+    uneven: list[Frame] = []
     if take.level and grids:
         take.reference = common_reference(grids)
-        gains = [frame_gain(grid, take.reference) for _, grid in kept]
+        uneven = [frame for frame, _, grid in kept if frame_gain(grid, take.reference) != 1]
         grids = [g / np.float32(frame_gain(g, take.reference)) for g in grids]
     if automatic and grids:
         take.background = find_background(grids, noise)
     if take.background is not None:
         make_folder(take.folder)
     levels = LitLevels()
-    for (frame, grid), gain in zip(kept, gains, strict=True):
-        seen = frame.seen
-        if gain != 1:
-            frame = frame._replace(gray=scaled_keys(frame.gray, 1 / gain))
+    for frame, keys, grid in kept:
+        if frame in uneven:
+            continue
+        seen = keys.seen
         if take.background is not None:
-            mask = figure_mask(grid / np.float32(gain), take.background)
+            mask = figure_mask(grid, take.background)
             free = full_size(mask, *take.footage.header.size, take.step) == 0
             seen = free if seen is None else seen & free
-        levels.add(frame._replace(seen=seen))
+        levels.add(keys._replace(seen=seen))
+    # Those whose exposure is off are read again, now that by how much is known.
+    for item in take.shown(uneven, True, keep=False):
+        if item is not None and item.keyed is not None:
+            levels.add(item.keyed)
     return _Samples(noise, levels, len(positions))
 
 

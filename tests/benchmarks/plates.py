@@ -150,9 +150,11 @@ def main() -> None:
                 ours = rows["ours"][figure]
                 paper = rows["paper"].get(figure)
                 met = sign * (ours - bound) >= 0
-                shown = f"{paper:10.3f}" if paper is not None else f"{'':>10}"
-                asked = asked if kind == "frames" else "no more than double the error"
-                print(f"  {figure:20}{shown}{ours:10.3f}   {asked}{'' if met else ': missed'}")
+                digits = 2 if sign > 0 else 4
+                shown = f"{paper:10.{digits}f}" if paper is not None else f"{'':>10}"
+                asked = asked if kind == "frames" else f"({asked} of clean frames)"
+                verdict = "" if met else ": missed"
+                print(f"  {figure:20}{shown}{ours:10.{digits}f}   {asked}{verdict}")
             sys.stdout.flush()
 
 

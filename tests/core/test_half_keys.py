@@ -10,7 +10,6 @@ from shadowtool.core.half_keys import (
     keys_per_unit,
     mean_of_keys,
     not_finite,
-    scaled_keys,
     to_keys,
 )
 
@@ -64,8 +63,16 @@ def test_halfs_are_left_alone_in_whatever_layout(halfs: np.ndarray) -> None:
     before = halfs.copy()
     turned = to_keys(halfs.T)
     assert np.array_equal(turned, to_keys(halfs).T)
-    gray_keys(to_keys(np.stack([halfs] * 3, axis=-1)))
     assert np.array_equal(halfs, before)
+
+
+def test_keys_are_left_alone() -> None:
+    keys = to_keys(np.random.default_rng(0).uniform(-1, 1, (5, 6, 3)).astype(np.float16))
+    before = keys.copy()
+    gray_keys(keys)
+    keys_per_unit(from_keys(keys))
+    mean_of_keys(keys, np.full(keys.shape, 2))
+    assert np.array_equal(keys, before)
 
 
 def of_keys(values: np.ndarray) -> np.ndarray:
@@ -128,18 +135,6 @@ def test_a_key_is_as_wide_as_the_spacing_of_halfs() -> None:
 def test_zero_is_spaced_as_the_least_halfs_are() -> None:
     least = keys_per_unit(POSITIVE[:1].astype(np.float32))
     assert np.array_equal(keys_per_unit(np.zeros(1, np.float32)), least)
-
-
-@given(HALFS, st.floats(0.5, 2))
-def test_scaled_keys_are_those_of_the_scaled_values(halfs: np.ndarray, factor: float) -> None:
-    product = halfs.astype(np.float32) * np.float32(factor)
-    expected = np.clip(product, -65504, 65504).astype(np.float16)
-    assert np.array_equal(from_keys(scaled_keys(to_keys(halfs), factor)), expected)
-
-
-def test_scaling_what_is_not_finite_gives_numbers() -> None:
-    keys = to_keys(np.float16([np.nan, np.inf, -np.inf]))
-    assert np.isfinite(from_keys(scaled_keys(keys, 1.1))).all()
 
 
 @given(st.floats(-65504, 65504, width=16))

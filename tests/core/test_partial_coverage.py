@@ -55,11 +55,11 @@ def crossed(ratio: np.ndarray, reached: np.ndarray, seed: int = 0, frames: int =
 
 def band(soft: float = 10) -> np.ndarray:
     """β reached by a shadow that went along the middle rows."""
-    return smoothstep((np.abs(ROWS - 45) - 17) / soft)
+    return smoothstep((np.abs(ROWS - 45) - 15) / soft)
 
 
-@settings(max_examples=10, deadline=None)
-@given(st.integers(0, 99), st.floats(5, 14), st.sampled_from([0.5, 1.0, 2.0]))
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 99), st.floats(5, 10), st.sampled_from([0.5, 1.0, 2.0]))
 def test_on_a_plane_the_shadow_is_near_the_truth_everywhere(
     seed: int, soft: float, depth: float
 ) -> None:
@@ -186,9 +186,8 @@ def test_where_nothing_was_shaded_the_shadow_is_the_light() -> None:
     assert shadow_ratio_field(take.lit, take.measured, take.frames, None) is None
 
 
-def test_a_penumbra_alone_tells_no_ratio() -> None:
-    reached = 0.45 + 0.55 * smoothstep(np.abs(ROWS - 45) / 20)
-    take = crossed(RATIO, reached)
+def test_what_climbs_everywhere_tells_no_ratio() -> None:
+    take = crossed(RATIO, np.clip((ROWS + 2) / 12, 0, 1))
     found = take.completed()
     assert np.isfinite(found.shadow).all()
     assert np.array_equal(found.shadow[take.frames == 0], take.lit[take.frames == 0])

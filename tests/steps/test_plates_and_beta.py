@@ -1,0 +1,412 @@
+"""Plates and β from footage on disk: a take of a small scene whose truth is known."""
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+from shadowtool.core.beta import shadow_matte
+from shadowtool.core.plates import ExtremePlates, Plates
+from shadowtool.io.image import Header, read_image, write_exr, write_png
+from shadowtool.io.products import MANIFEST, read_plates
+from shadowtool.steps.composite import composite
+from shadowtool.steps.matte import matte
+from shadowtool.steps.plate import plate
+from shadowtool.steps.run import Run
+from tests.scene import Scene, smoothstep
+
+HEIGHT, WIDTH, FRAMES, FIRST = 54, 96, 30, 1001
+SCENE = Scene(HEIGHT, WIDTH, rows=(0, 0), columns=(0, 0))
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+NUMBERS = range(FIRST, FIRST + FRAMES)
+DIP = range(FIRST + 10, FIRST + 20)
+
+
+def band_beta(number: int) -> np.ndarray:
+    """β of a shadow that passes over the lower half of the picture."""
+    middle = -22 + 4.8 * (number - FIRST)
+    beside = smoothstep((np.abs(COLUMNS - middle) - 12) / 3 + 0.5)
+    above = smoothstep((32 - ROWS) / 3 + 0.5)
+    return np.maximum(beside, above).astype(np.float32)
+
+
+def figure_alpha(number: int) -> np.ndarray:
+    left = 4 + 2.7 * (number - FIRST)
+    return ((left <= COLUMNS) & (left + 9 > COLUMNS) & (ROWS >= 6) & (ROWS < 32)).astype(np.float32)
+
+
+def picture(number: int, figure: bool = False, gain: float = 1.0) -> np.ndarray:
+    """A frame of the take, (H, W, 3) half."""
+    image = SCENE.image(band_beta(number))
+    if figure:
+        colour = np.where((ROWS < 15)[..., None], (0.9, 0.05, 0.05), (0.02, 0.3, 0.9))
+        image = np.where(figure_alpha(number)[..., None] > 0, colour, image)
+    return (SCENE.noisy(image, number) * np.float32(gain)).astype(np.float16)
+
+
+def write_frames(folder: Path, pictures: Iterable[np.ndarray]) -> Path:
+    folder.mkdir(parents=True)
+    for number, image in enumerate(pictures, start=FIRST):
+        write_exr(folder / f"{folder.name}.{number}.exr", {"RGB": image}, Header(WIDTH, HEIGHT))
+    return folder
+
+
+def write_mattes(folder: Path, mattes: Iterable[np.ndarray]) -> Path:
+    folder.mkdir(parents=True)
+    for number, alpha in enumerate(mattes, start=FIRST):
+        write_png(folder / f"{folder.name}.{number}.png", (alpha * 255).astype(np.uint8))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The take with a figure, without one, and without one but with a dip in exposure."""
+    folder = tmp_path_factory.mktemp("takes")
+    write_frames(folder / "walk", (picture(n, figure=True) for n in NUMBERS))
+    write_frames(folder / "plain", (picture(n) for n in NUMBERS))
+    dipped = (picture(n, gain=0.9 if n in DIP else 1.0) for n in NUMBERS)
+    write_frames(folder / "dip", dipped)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def walk_plates(takes: Path) -> Path:
+    """The plates of the take with a figure; nobody writes here."""
+    folder = takes / "walk-plates" / "plates"
+    plate(takes / "walk", folder, run=Run(jobs=3))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def level_plates(takes: Path) -> Path:
+    """The plates of the takes without and with a dip in exposure; nobody writes here."""
+    for name in ("plain", "dip"):
+        plate(takes / name, takes / "level" / name, holdout="none")
+    return takes / "level"
+
+
+def plates_of(folder: Path) -> Plates:
+    return read_plates(folder).plates
+
+
+def figures_of(folder: Path) -> dict:
+    return json.loads((folder / MANIFEST).read_text())["figures"]
+
+
+def error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """As a part of the true value, (H, W)."""
+    return np.abs(np.log(found.sum(axis=-1) / truth.sum(axis=-1)))
+
+
+def held_out(folder: Path) -> list[np.ndarray]:
+    return [read_image(folder / "holdout" / f"holdout.{n}.png").plane("Y") > 0 for n in NUMBERS]
+
+
+def beta_of(folder: Path, number: int) -> np.ndarray:
+    image = read_image(folder / "beta" / f"beta.{number}.exr")
+    colour = image.layers.get("RGB")
+    return image.plane("Y") if colour is None else colour.astype(np.float32)
+
+
+def test_plates_keep_the_figure_out_and_find_the_shadow(takes: Path, tmp_path: Path) -> None:
+    result = plate(takes / "walk", tmp_path / "plates")
+    found = plates_of(tmp_path / "plates")
+    assert error(found.lit, SCENE.lit).mean() < 0.005
+    assert error(found.lit, SCENE.lit).max() < 0.05
+    swept = ROWS > 35
+    assert error(found.shadow, SCENE.shadow)[swept].mean() < 0.02
+    assert error(found.shadow, SCENE.shadow).mean() < 0.06
+    masks = held_out(tmp_path / "plates")
+    assert len(list((tmp_path / "plates" / "holdout").iterdir())) == FRAMES
+    for number, mask in zip(NUMBERS, masks, strict=True):
+        assert mask[figure_alpha(number) > 0].mean() >= 0.98
+    assert np.mean(masks) < 0.2
+    assert result.figures["held_out"] == "holdout"
+    assert result.figures["read_as"] == "a plane that a shadow crossed"
+
+
+def test_what_was_held_out_can_be_given_back(
+    takes: Path, walk_plates: Path, tmp_path: Path
+) -> None:
+    plate(takes / "walk", tmp_path / "given", holdout=walk_plates / "holdout")
+    auto, given = plates_of(walk_plates), plates_of(tmp_path / "given")
+    assert np.array_equal(auto.lit, given.lit)
+    assert np.array_equal(auto.shadow, given.shadow)
+    assert not (tmp_path / "given" / "holdout").exists()
+
+
+def test_a_take_without_a_figure_holds_nothing_out(
+    takes: Path, level_plates: Path, tmp_path: Path
+) -> None:
+    plate(takes / "plain", tmp_path / "auto")
+    assert not np.any(held_out(tmp_path / "auto"))
+    auto, none = plates_of(tmp_path / "auto"), plates_of(level_plates / "plain")
+    assert np.array_equal(auto.lit, none.lit) and np.array_equal(auto.shadow, none.shadow)
+    assert not (level_plates / "plain" / "holdout").exists()
+
+
+def test_the_matte_of_a_take_is_the_shadow_that_fell(
+    takes: Path, walk_plates: Path, tmp_path: Path
+) -> None:
+    matte(takes / "walk", tmp_path / "matte", plates=walk_plates)
+    for number in NUMBERS[::6]:
+        beta, truth = beta_of(tmp_path / "matte", number), band_beta(number)
+        visible = figure_alpha(number) == 0
+        assert np.abs(beta - truth)[visible].mean() < 0.01
+        assert beta.min() >= 0 and beta.max() <= 1
+        # At its rim the figure may be taken to reach a little further than it does.
+        near = cv2.dilate(figure_alpha(number), np.ones((9, 9))) > 0
+        assert (beta[~near & (truth == 1)] == 1).mean() > 0.98
+
+
+def test_minmax_is_the_extremes_bit_for_bit(takes: Path, tmp_path: Path) -> None:
+    # A change of exposure is no business of Eq. (4).
+    plate(takes / "dip", tmp_path / "plates", estimator="minmax", holdout="none", gain="auto")
+    frames = np.stack([read_image(p).rgb() for p in sorted((takes / "dip").iterdir())])
+    lit, shadow = frames.max(axis=0), frames.min(axis=0)
+    found = plates_of(tmp_path / "plates")
+    assert np.array_equal(found.lit, lit.astype(np.float32))
+    assert np.array_equal(found.shadow, shadow.astype(np.float32))
+    assert (found.frames == FRAMES).all()
+
+
+def test_the_number_of_threads_changes_no_bit(
+    takes: Path, walk_plates: Path, tmp_path: Path, tree
+) -> None:
+    plate(takes / "walk", tmp_path / "plates", run=Run(jobs=1))
+    assert tree(tmp_path / "plates") == tree(walk_plates)
+
+
+def test_a_dip_in_exposure_changes_next_to_nothing(
+    takes: Path, level_plates: Path, tmp_path: Path
+) -> None:
+    for name in ("plain", "dip"):
+        matte(takes / name, tmp_path / f"{name}-matte", plates=level_plates / name, only="beta")
+    plain, dip = plates_of(level_plates / "plain"), plates_of(level_plates / "dip")
+    assert error(dip.lit, plain.lit).mean() < 0.003
+    assert error(dip.shadow, plain.shadow)[ROWS > 35].mean() < 0.01
+    betas = [
+        [beta_of(tmp_path / f"{name}-matte", number) for number in NUMBERS]
+        for name in ("plain", "dip")
+    ]
+    assert np.abs(np.subtract(*betas)).mean() < 0.003
+    assert np.abs(np.subtract(*betas)).max(axis=0).mean() < 0.02
+
+
+def test_gains_are_recorded(takes: Path, level_plates: Path, tmp_path: Path) -> None:
+    gains = figures_of(level_plates / "dip")["gains"]
+    assert set(gains) == {str(number) for number in DIP}
+    assert list(gains.values()) == pytest.approx([0.9] * len(DIP), rel=0.005)
+    matte(takes / "dip", tmp_path / "matte", plates=level_plates / "dip", only="beta")
+    gain = figures_of(tmp_path / "matte")["gain"]
+    assert gain["least"] == pytest.approx(0.9, rel=0.005) and gain["most"] == 1
+    rows = json.loads((tmp_path / "matte" / MANIFEST).read_text())["frames"]
+    assert [n for n in NUMBERS if rows[str(n)]["gain"] != 1] == list(DIP)
+
+
+def test_a_steady_take_has_no_gains(takes: Path, level_plates: Path, tmp_path: Path) -> None:
+    plate(takes / "plain", tmp_path / "none", holdout="none", gain="none")
+    assert figures_of(level_plates / "plain")["gains"] == {}
+    one, other = plates_of(level_plates / "plain"), plates_of(tmp_path / "none")
+    assert np.array_equal(one.lit, other.lit) and np.array_equal(one.shadow, other.shadow)
+
+
+def test_without_gains_plates_are_those_of_the_frames_as_they_are(
+    takes: Path, tmp_path: Path
+) -> None:
+    plate(takes / "dip", tmp_path / "plates", holdout="none", gain="none")
+    assert figures_of(tmp_path / "plates")["gains"] == {}
+
+
+def test_without_gains_a_dip_is_shadow(takes: Path, tmp_path: Path) -> None:
+    truth = tmp_path / "truth"
+    write_plates(truth)
+    alpha = write_mattes(tmp_path / "alpha", [np.zeros((HEIGHT, WIDTH))] * FRAMES)
+    for gain in ("auto", "none"):
+        out = tmp_path / gain
+        matte(takes / "dip", out, plates=truth, alpha=alpha, only="beta", gain=gain)
+    dark = DIP[5]
+    lit = band_beta(dark) == 1
+    assert beta_of(tmp_path / "none", dark)[lit].mean() == pytest.approx(0.88, abs=0.02)
+    assert beta_of(tmp_path / "auto", dark)[lit].mean() == pytest.approx(1, abs=0.003)
+
+
+def write_plates(folder: Path) -> Path:
+    """The true plates as another program would give them."""
+    folder.mkdir()
+    for name in ("lit", "shadow"):
+        values = getattr(SCENE, name)
+        write_exr(folder / f"{name}.exr", {"RGB": values}, Header(WIDTH, HEIGHT))
+    return folder
+
+
+def coloured_light(number: int) -> np.ndarray:
+    """β of a coloured filter's soft shadow with a caustic beside it, (H, W, 3)."""
+    middle = 30 + 4 * (number - FIRST)
+    filtered = 1 - smoothstep((14 - np.hypot(COLUMNS - middle, ROWS - 27)) / 4 + 0.5)
+    beta = 1 - (1 - filtered[..., None]) * (1 - np.array([0.85, 0.45, 0.15]))
+    caustic = smoothstep((6 - np.hypot(COLUMNS - middle - 28, ROWS - 27)) / 3 + 0.5)
+    return (beta + 0.4 * caustic[..., None]).astype(np.float32)
+
+
+class Coloured(NamedTuple):
+    frames: Path
+    plates: Path
+    alpha: Path
+    clean: list[np.ndarray]
+
+
+@pytest.fixture
+def coloured(tmp_path: Path) -> Coloured:
+    betas = [coloured_light(FIRST + i) for i in range(4)]
+    clean = [SCENE.shadow + beta * (SCENE.lit - SCENE.shadow) for beta in betas]
+    noisy = (SCENE.noisy(image, seed).astype(np.float16) for seed, image in enumerate(clean))
+    frames = write_frames(tmp_path / "glass", noisy)
+    alpha = write_mattes(tmp_path / "alpha", [np.zeros((HEIGHT, WIDTH))] * 4)
+    return Coloured(frames, write_plates(tmp_path / "truth"), alpha, clean)
+
+
+def test_coloured_light_and_caustics_go_through_the_chain(
+    coloured: Coloured, command, tmp_path: Path
+) -> None:
+    out, final = tmp_path / "matte", tmp_path / "final"
+    words = ["--plates", coloured.plates, "--alpha", coloured.alpha, "--beta", "rgb", "--no-clamp"]
+    outcome = command("matte", coloured.frames, "-o", out, *words)
+    assert outcome.code == 0, outcome.err
+    outcome = command("composite", out, "-o", final, "--plates", coloured.plates)
+    assert outcome.code == 0, outcome.err
+    for index, clean in enumerate(coloured.clean):
+        truth, found = coloured_light(FIRST + index), beta_of(out, FIRST + index)
+        assert found.shape == (HEIGHT, WIDTH, 3)
+        assert np.abs(found - truth).mean(axis=(0, 1)).max() < 0.015
+        caustic = truth.min(axis=-1) > 1.39
+        assert found[caustic].mean() == pytest.approx(1.4, abs=0.01)
+        assert (found[(truth == 1).all(axis=-1)] == 1).mean() > 0.95
+        back = read_image(final / f"final.{FIRST + index}.exr").rgb().astype(np.float32)
+        noise = 0.003 * np.sqrt(np.maximum(clean, 0.01) / 0.18)
+        assert np.sqrt(np.mean(((back - clean) / noise) ** 2)) < 1.2
+
+
+def test_without_a_given_matte_the_picture_comes_back_too(
+    coloured: Coloured, tmp_path: Path
+) -> None:
+    matte(coloured.frames, tmp_path / "matte", plates=coloured.plates, beta="rgb", clamp=False)
+    composite(tmp_path / "matte", tmp_path / "final", plates=coloured.plates)
+    for index, clean in enumerate(coloured.clean):
+        back = read_image(tmp_path / "final" / f"final.{FIRST + index}.exr").rgb()
+        noise = 0.003 * np.sqrt(np.maximum(clean, 0.01) / 0.18)
+        assert np.abs((back.astype(np.float32) - clean) / noise).mean() < 1.2
+
+
+def test_clamped_light_stays_between_shadow_and_light(coloured: Coloured, tmp_path: Path) -> None:
+    common = {"plates": coloured.plates, "alpha": coloured.alpha, "only": "beta"}
+    matte(coloured.frames, tmp_path / "rgb", beta="rgb", **common)
+    matte(coloured.frames, tmp_path / "free", beta="scalar", clamp=False, **common)
+    clamped, free = beta_of(tmp_path / "rgb", FIRST), beta_of(tmp_path / "free", FIRST)
+    assert clamped.min() >= 0 and clamped.max() == 1
+    assert free.shape == (HEIGHT, WIDTH) and free.max() > 1.3
+
+
+def test_two_lights_add_up() -> None:
+    sky = SCENE.shadow
+    keys = [
+        SCENE.lit - SCENE.shadow,
+        0.6 * np.random.default_rng(7).uniform(0.2, 0.6, SCENE.lit.shape).astype(np.float32),
+    ]
+    shadows = [
+        [band_beta(n) for n in NUMBERS],
+        [SCENE.disk(90 - 3.6 * i, 20 + i, radius=14) for i in range(FRAMES)],
+    ]
+    both = [
+        sky + sum(beta[..., None] * key for beta, key in zip(pair, keys, strict=True))
+        for pair in zip(*shadows, strict=True)
+    ]
+    chains = []
+    for key, betas in zip(keys, shadows, strict=True):
+        alone = [sky + beta[..., None] * key for beta in betas]
+        extremes = ExtremePlates()
+        for frame in alone:
+            extremes.add(frame)
+        extremes.add(sky)
+        plates = extremes.plates()
+        matted = [shadow_matte(frame, plates.lit, plates.shadow) for frame in alone]
+        chains.append((plates, matted))
+    shadow = chains[0][0].shadow
+    for index, truth in enumerate(both):
+        total = shadow + sum(
+            matted[index][..., None] * (plates.lit - plates.shadow) for plates, matted in chains
+        )
+        assert np.abs(total - truth).max() < 1e-4
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    """When each file but the manifest was written."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST]
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in files}
+
+
+def test_resuming_keeps_what_is_current(takes: Path, tmp_path: Path) -> None:
+    first = plate(takes / "walk", tmp_path / "plates")
+    before = stamps(tmp_path / "plates")
+    second = plate(takes / "walk", tmp_path / "plates", run=Run(resume=True))
+    assert stamps(tmp_path / "plates") == before
+    assert second.kept == FRAMES and first.kept == 0
+    assert second.figures == first.figures
+
+
+def test_resuming_makes_anew_what_rests_on_a_changed_frame(
+    takes: Path, walk_plates: Path, tmp_path: Path
+) -> None:
+    take = shutil.copytree(takes / "walk", tmp_path / "walk")
+    shutil.copytree(walk_plates, tmp_path / "plates")
+    changed = picture(FIRST + 3, figure=True)
+    changed[40:50, 60:80] = SCENE.lit[40:50, 60:80] * 0.9
+    frame = take / f"walk.{FIRST + 3}.exr"
+    write_exr(frame, {"RGB": changed}, Header(WIDTH, HEIGHT))
+    again = plate(take, tmp_path / "plates", run=Run(resume=True))
+    assert again.kept == 0
+    plate(take, tmp_path / "fresh")
+    for name in ("lit", "shadow", "confidence"):
+        files = [tmp_path / folder / f"{name}.exr" for folder in ("plates", "fresh")]
+        assert files[0].read_bytes() == files[1].read_bytes()
+
+
+@pytest.mark.parametrize("options", [{"estimator": "minmax"}, {"gain": "none"}])
+def test_resuming_with_another_option_makes_anew(
+    takes: Path, level_plates: Path, tmp_path: Path, options: dict[str, str]
+) -> None:
+    shutil.copytree(level_plates / "dip", tmp_path / "plates")
+    again = plate(
+        takes / "dip", tmp_path / "plates", holdout="none", run=Run(resume=True), **options
+    )
+    assert again.kept == 0
+
+
+def test_resuming_brings_back_a_holdout_that_is_gone(
+    takes: Path, walk_plates: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(walk_plates, tmp_path / "plates")
+    gone = tmp_path / "plates" / "holdout" / f"holdout.{FIRST + 4}.png"
+    before = gone.read_bytes()
+    gone.unlink()
+    plate(takes / "walk", tmp_path / "plates", run=Run(resume=True))
+    assert gone.read_bytes() == before
+
+
+def test_a_holdout_that_someone_corrected_is_not_replaced_unasked(
+    takes: Path, walk_plates: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(walk_plates, tmp_path / "plates")
+    corrected = tmp_path / "plates" / "holdout" / f"holdout.{FIRST + 4}.png"
+    write_png(corrected, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    before = corrected.read_bytes()
+    shutil.copytree(tmp_path / "plates" / "holdout", tmp_path / "roto")
+    plate(takes / "walk", tmp_path / "plates", run=Run(resume=True))
+    assert corrected.read_bytes() == before
+    plate(takes / "walk", tmp_path / "again", holdout=tmp_path / "roto")
+    assert plates_of(tmp_path / "again").frames.max() <= FRAMES - 1

@@ -11,21 +11,6 @@ from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
 
-# How much of the sky stays at the foot of a figure, at least.
-_DEEPEST = 0.6
-
-
-def background_distance(
-    image: Float32, lit: Float32, shadow: Float32, noise: NoiseModel, tolerance: float
-) -> Float32:
-    """As `line_distance`, but for a line that goes on below S towards black: near its feet a
-    figure takes some of the sky away from the ground, too."""
-    deeper = np.float32(_DEEPEST) * shadow
-    return np.minimum(
-        line_distance(image, lit, shadow, noise, tolerance),
-        line_distance(image, shadow, deeper, noise, tolerance),
-    )
-
 
 def line_distance(
     image: Float32, lit: Float32, shadow: Float32, noise: NoiseModel, tolerance: float

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Beta, Fill, Gain, Only
 from shadowtool.core import beta as shadow_beta
-from shadowtool.core.color_line import background_distance
+from shadowtool.core.color_line import line_distance
 from shadowtool.core.compositing import shade
 from shadowtool.core.exposure import frame_gain, without_gain
 from shadowtool.core.holdout import grid_step, on_grid
@@ -142,7 +142,7 @@ def matte(
         if "alpha" in given:
             coverage = np.clip(_matte_plane(given["alpha"].path(frame)), 0, 1)
         else:
-            distance = background_distance(image, scene.lit, scene.shadow, noise, _TOLERANCE)
+            distance = line_distance(image, scene.lit, scene.shadow, noise, _TOLERANCE)
             if "trimap" in given:
                 regions = _trimap_plane(given["trimap"].path(frame))
             else:

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowtool.core.color_line import background_distance, line_distance
+from shadowtool.core.color_line import line_distance
 from shadowtool.core.noise import NoiseModel
 from tests.scene import Scene
 
@@ -82,33 +82,9 @@ def test_unknown_pixels_are_at_no_distance() -> None:
     found = line_distance(image.astype(np.float32), lit, SCENE.shadow, EVEN, 0.01)
     assert found[3, 4] == 0 and found[5, 6] == 0
     assert (found > 1).sum() == found.size - 2
-    assert background_distance(image.astype(np.float32), lit, SCENE.shadow, EVEN, 0.01)[3, 4] == 0
 
 
 def test_without_a_shadow_the_line_is_a_point() -> None:
     image = (SCENE.lit + 7 * SIGMA * along()).astype(np.float32)
     found = line_distance(image, SCENE.lit, SCENE.lit, EVEN, 0)
     assert found == pytest.approx(7, rel=0.01)
-
-
-@given(st.floats(0.65, 1))
-def test_background_goes_on_below_the_shadow(part: float) -> None:
-    image = np.float32(part) * SCENE.shadow
-    assert background_distance(image, SCENE.lit, SCENE.shadow, EVEN, 0) == pytest.approx(
-        0, abs=0.01
-    )
-
-
-def test_background_does_not_go_on_to_black_nor_above_lit() -> None:
-    noise = NoiseModel(np.zeros(3), np.full(3, 1e-6))
-    black = np.zeros_like(SCENE.lit)
-    assert (background_distance(black, SCENE.lit, SCENE.shadow, noise, 0.01) > 4).all()
-    bright = 1.3 * SCENE.lit
-    assert (background_distance(bright, SCENE.lit, SCENE.shadow, noise, 0.01) > 4).all()
-
-
-@given(st.integers(0, 50))
-def test_background_is_never_further_than_the_line(seed: int) -> None:
-    image = np.random.default_rng(seed).uniform(0, 1, SCENE.lit.shape).astype(np.float32)
-    found = background_distance(image, SCENE.lit, SCENE.shadow, CAMERA, 0.01)
-    assert (found <= distance(image, CAMERA, 0.01)).all() and (found >= 0).all()

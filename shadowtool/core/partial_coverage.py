@@ -49,7 +49,7 @@ def shadow_ratio_field(
     Returns:
         (H, W, 3) float32 and the spread of log ratios; None if nothing was shaded in full.
     """
-    ratio, gray = _log_ratios(lit, shadow)
+    gray = _log_ratio(lit.sum(axis=-1), shadow.sum(axis=-1))
     firm = (frames >= _FIRM) & np.isfinite(gray)
     if plane is not None:
         firm &= plane
@@ -59,6 +59,7 @@ def shadow_ratio_field(
         return None
     common = _mode(gray[level])
     members = level & (np.abs(gray - common) < _COMMON)
+    ratio = _log_ratio(lit, shadow)
     field = _smooth(ratio, members)
     members &= np.abs(gray - field.mean(axis=-1)) < _COMMON / 2
     if members.sum() < 50:
@@ -118,7 +119,7 @@ def complete_shadow(
     if found is None:
         return Completed(measured, np.asarray(dark, np.float32), partial=False)
     field, spread = found
-    _, gray = _log_ratios(lit, shadow)
+    gray = _log_ratio(lit.sum(axis=-1), shadow.sum(axis=-1))
     excess = np.nan_to_num(gray - np.log(field.mean(axis=-1)), nan=np.inf)
     alike = np.asarray(np.abs(excess) < _ALIKE * spread)
     brighter, darker = excess >= _ALIKE * spread, excess <= -_ALIKE * spread
@@ -147,12 +148,11 @@ def _opened(mask: Bool) -> Bool:
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
 
 
-def _log_ratios(lit: Float32, shadow: Float32) -> tuple[Float32, Float32]:
-    """log(S/L) of each channel, and of their weighted sum; NaN where unknown or not positive."""
+def _log_ratio(lit: Float32, shadow: Float32) -> Float32:
+    """log(S/L), NaN where either is unknown."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        channels = np.log(np.maximum(shadow, 1e-5) / np.maximum(lit, 1e-5))
-        gray = np.log(np.maximum(shadow.sum(axis=-1), 1e-5) / np.maximum(lit.sum(axis=-1), 1e-5))
-    return channels.astype(np.float32), gray.astype(np.float32)
+        ratio = np.maximum(shadow, np.float32(1e-5)) / np.maximum(lit, np.float32(1e-5))
+        return np.asarray(np.log(ratio), np.float32)
 
 
 def _slope(gray: Float32) -> Float32:

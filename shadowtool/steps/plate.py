@@ -279,12 +279,13 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     """Read a few frames; find the automatic holdout's background in them if that is wanted."""
     pairs = {position: number for number, position in sample_positions(len(frames)).items()}
     spread = np.linspace(0, len(frames) - 1, SAMPLES).round().astype(int).tolist()
-    positions = sorted({*pairs, *spread} if automatic or with_levels else set(pairs))
+    # The same frames whether the figure is found or given: what was found can be given back.
+    positions = sorted({*pairs, *spread})
     chosen = [frames[position] for position in positions]
     thinned: dict[int, NDArray[np.float32]] = {}
     grids: list[NDArray[np.float32]] = []
     kept: list[tuple[Frame, Keyed, NDArray[np.float32]]] = []
-    for count, item in enumerate(take.shown(chosen, False, keep=False)):
+    for count, item in enumerate(take.shown(chosen, with_levels, keep=False)):
         take.run.progress(count, len(positions) + len(frames))
         if item is None:
             continue
@@ -293,9 +294,8 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         grid = on_grid(item.values, take.step)
         if positions[count] in spread:
             grids.append(grid)
-        if with_levels:
-            keys = keyed(item.values, item.holdout)._replace(keys=_NO_KEYS)
-            kept.append((chosen[count], keys, grid))
+        if item.keyed is not None:
+            kept.append((chosen[count], item.keyed._replace(keys=_NO_KEYS), grid))
     noise = noise_model(noise_levels(thinned))
     uneven: list[Frame] = []
     if take.level and grids:

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Beta, Fill, Gain, Only
 from shadowtool.core import beta as shadow_beta
-from shadowtool.core.color_line import line_distance
 from shadowtool.core.compositing import shade
 from shadowtool.core.exposure import frame_gain, without_gain
 from shadowtool.core.holdout import grid_step, on_grid
 from shadowtool.core.matting import (
     difference_alpha,
     difference_trimap,
+    figure_distance,
     pull_figure,
 )
 from shadowtool.errors import OptionError
@@ -28,8 +28,6 @@ logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 
-# How exact plates are, as a part of their value.
-_TOLERANCE = 0.015
 # A figure larger than this part of the picture is none.
 _TOO_MUCH = 0.5
 
@@ -142,7 +140,13 @@ def matte(
         if "alpha" in given:
             coverage = np.clip(_matte_plane(given["alpha"].path(frame)), 0, 1)
         else:
-            distance = line_distance(image, scene.lit, scene.shadow, noise, _TOLERANCE)
+            distance = figure_distance(
+                image,
+                shadow_beta.shadow_matte(image, scene.lit, scene.shadow),
+                scene.lit,
+                scene.shadow,
+                noise,
+            )
             if "trimap" in given:
                 regions = _trimap_plane(given["trimap"].path(frame))
             else:

@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
 
+from shadowtool.core.beta import shadow_matte
 from shadowtool.core.color_line import line_distance
 from shadowtool.core.matting import (
     BACKGROUND,
     FIGURE,
     difference_alpha,
     difference_trimap,
+    figure_distance,
     pull_figure,
 )
 from shadowtool.core.noise import NoiseModel
@@ -78,3 +80,17 @@ def test_the_figure_over_its_own_background_is_the_picture() -> None:
     assert again[solid] == pytest.approx(np.maximum(image, 0)[solid], abs=0.02)
     assert (figure.foreground[alpha == 0] == 0).all()
     assert (figure.foreground >= 0).all()
+
+
+def dark_patch(beta: np.ndarray) -> np.ndarray:
+    """How much of a patch that is darker than S, on ground under β, is taken for figure."""
+    image = SCENE.image(beta)
+    image[40:50, 70:80] = np.float32(0.8) * SCENE.shadow[40:50, 70:80]
+    found = shadow_matte(image, SCENE.lit, SCENE.shadow)
+    distance = figure_distance(image, found, SCENE.lit, SCENE.shadow, NOISE)
+    return (distance[41:49, 71:79] > 4).mean()
+
+
+def test_what_is_darker_than_shadow_is_a_figure_on_lit_ground_and_shadow_within_shadow() -> None:
+    assert dark_patch(np.ones((90, 160), np.float32)) > 0.9
+    assert dark_patch(np.zeros((90, 160), np.float32)) == 0

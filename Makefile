@@ -20,6 +20,7 @@ test: .venv/installed-dev
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.benchmarks.footage
 	$(BIN)/python -m tests.benchmarks.plates
+	$(BIN)/python -m tests.benchmarks.warp
 
 format: .venv/installed-dev
 	$(BIN)/ruff check --fix .

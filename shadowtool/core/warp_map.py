@@ -17,8 +17,8 @@ Float64 = NDArray[np.float64]
 
 # Passes less far apart than this can't fix a point.
 LEAST_ANGLE = np.radians(10.0)
-# A time read off whole frames is uniformly distributed over one: its standard deviation.
-_FRAME_SIGMA = 1 / np.sqrt(12)
+# Standard deviation of a refined time, in frames: what rendered sweeps of sharp shadows show.
+_FRAME_SIGMA = 0.06
 _LEAST_WEIGHT = 1e-3
 
 

@@ -16,6 +16,7 @@ from shadowtool.core.shadow_time import (
     ShadowTimes,
     least_contrast,
     luminance,
+    refine_times,
     without_shade,
 )
 from shadowtool.core.warp_map import Pass, line_speed
@@ -147,6 +148,9 @@ def _times(
         run.progress(number, total)
     run.progress(total, total)
     times = without_shade(crossings.times(), span.highest, region)
+    numbers = np.array([float(frame) for frame in used])
+    refined = refine_times(times.time, numbers, crossings.sharpness)
+    times = ShadowTimes(refined, times.contrast)
     return times, marks, used, footage.read(used[0])
 
 

@@ -48,7 +48,7 @@ def warp(
     map_file: Path | None = None,
     apply_to: str | Path | None = None,
     outside: float = 1.0,
-    iterations: int = 40,
+    iterations: int = 20,
 ) -> list[Result]:
     """Solve a map from scans, or take one that is there, and see frames through it.
 

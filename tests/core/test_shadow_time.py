@@ -8,6 +8,8 @@ from shadowtool.core.shadow_time import (
     ShadowTimes,
     least_contrast,
     luminance,
+    refine_times,
+    without_shade,
 )
 from tests.scene import Scene, Sweep
 
@@ -91,3 +93,55 @@ def test_a_broken_pixel_does_not_spread() -> None:
 def test_contrast_is_the_range_of_the_luminance() -> None:
     found = times_of(sweep_frames(Sweep(0.0))).contrast
     assert found == pytest.approx(luminance(SCENE.lit) - luminance(SCENE.shadow), abs=0.01)
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.2, 2.5, 4.0])
+def test_an_edge_sharper_than_its_step_is_told_apart_by_the_neighbours(angle: float) -> None:
+    sweep = Sweep(angle, speed=9.0, soft=1.0, width=30.0)
+    found = times_of(sweep_frames(sweep, 0.003)).time
+    frames = np.arange(1001.0, 1001.0 + SCENE.frames_of(sweep))
+    refined = refine_times(found, frames, np.ones_like(found))
+    error, before = (np.abs(t - true_times(sweep))[SCENE.plane] for t in (refined, found))
+    assert np.nanmedian(error) < 0.3 * np.nanmedian(before)
+
+
+def test_refined_times_stay_between_their_frames_and_unknown_ones_unknown() -> None:
+    rng = np.random.default_rng(0)
+    frames = np.arange(10.0, 40.0, 2.0)
+    time = rng.uniform(10.1, 37.9, (30, 40)).astype(np.float32)
+    time[rng.uniform(size=time.shape) < 0.2] = np.nan
+    before = time.copy()
+    refined = refine_times(time, frames, np.ones_like(time))
+    assert np.array_equal(np.isnan(refined), np.isnan(before))
+    assert np.array_equal(time, before, equal_nan=True)
+    known = np.isfinite(time)
+    last = np.searchsorted(frames, time[known])
+    assert (refined[known] <= frames[last] + 1e-4).all()
+    assert (refined[known] >= frames[last - 1] - 1e-4).all()
+
+
+def test_times_are_not_drawn_over_the_step_of_an_object() -> None:
+    time = np.tile(np.linspace(1001, 1006, 60, dtype=np.float32), (20, 1))
+    time[:, 30:] += 4
+    error = np.abs(refine_times(time, np.arange(1001.0, 1030.0), np.ones_like(time)) - time)
+    # A ramp ends flat where there is nothing beyond; nothing of the other side comes over.
+    assert error.max() < 0.3
+    assert error[:, 10:20].max() < 0.01 and error[:, 40:50].max() < 0.01
+
+
+def test_what_loses_only_sky_to_the_stick_has_no_time() -> None:
+    highest = np.ones((10, 10), np.float32)
+    contrast = np.full((10, 10), 0.8, np.float32)
+    contrast[:3] = 0.1
+    times = ShadowTimes(np.full((10, 10), 5, np.float32), contrast)
+    plane = np.zeros((10, 10), bool)
+    plane[5:] = True
+    lit = without_shade(times, highest, plane)
+    assert np.isnan(lit.time[:3]).all() and np.isfinite(lit.time[3:]).all()
+    assert np.array_equal(without_shade(times, highest, ~plane & False).time, times.time)
+
+
+def test_of_soft_edges_interpolation_stands() -> None:
+    time = np.random.default_rng(0).uniform(1001, 1020, (20, 30)).astype(np.float32)
+    soft = np.full_like(time, 0.3)
+    assert refine_times(time, np.arange(1001.0, 1030.0), soft) == pytest.approx(time, abs=1e-3)

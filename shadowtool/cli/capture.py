@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from shadowtool.choices import FORMATS
-from shadowtool.cli.options import step_command, transfer_option
+from shadowtool.cli.options import format_option, step_command, transfer_option
 
 if TYPE_CHECKING:
     from shadowtool.steps.capture import Crop
@@ -35,14 +34,7 @@ def _crop(ctx: click.Context, parameter: click.Parameter, value: str | None) -> 
 )
 @click.option("--crop", callback=_crop, metavar="WxH+X+Y", help="Part of the picture to keep.")
 @click.option("--scale", type=float, default=1.0, metavar="FACTOR", help="Resize, after --crop.")
-@click.option(
-    "--format",
-    "file_format",
-    type=click.Choice(FORMATS),
-    default="exr",
-    show_default=True,
-    help="exr: linear half. png: 16 bit, sRGB-encoded.",
-)
+@format_option
 @click.option("--strict", is_flag=True, help="Fail if the camera moved.")
 @click.option("--device", type=click.IntRange(min=0), metavar="N", help="Record from a camera.")
 @click.option("--seconds", type=float, metavar="T", help="How long to record.")

@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
-from shadowtool.choices import FILLS, FORMATS
-from shadowtool.cli.options import folder_option, step_command
+from shadowtool.choices import FILLS
+from shadowtool.cli.options import folder_option, format_option, step_command
 
 
 @click.command()
@@ -28,14 +28,7 @@ from shadowtool.cli.options import folder_option, step_command
     show_default=True,
     help="What β becomes where it is unknown (NaN).",
 )
-@click.option(
-    "--format",
-    "file_format",
-    type=click.Choice(FORMATS),
-    default="exr",
-    show_default=True,
-    help="exr: linear half. png: 16 bit, sRGB-encoded.",
-)
+@format_option
 @step_command
 def command(mattes: Path | None, output: Path, **options: Any) -> list[Any]:
     """Put the figure and its shadow into the target scene.

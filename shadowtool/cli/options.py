@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import click
 
-from shadowtool.choices import GAINS, MISSING, PROGRESS, TRANSFER_NAMES
+from shadowtool.choices import FORMATS, GAINS, MISSING, PROGRESS, TRANSFER_NAMES
 from shadowtool.cli.progress import reporter
 from shadowtool.cli.report import report
 
@@ -67,6 +67,14 @@ transfer_option = click.option(
 )
 
 
+format_option = click.option(
+    "--format",
+    "file_format",
+    type=click.Choice(FORMATS),
+    default="exr",
+    show_default=True,
+    help="exr: linear half. png: 16 bit, sRGB-encoded.",
+)
 gain_option = click.option(
     "--gain",
     type=click.Choice(GAINS),

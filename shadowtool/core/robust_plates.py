@@ -139,7 +139,7 @@ class RobustPlates:
         """Args: the lit levels of the first reading, (H, W), and the take's noise."""
         unsampled = levels == _LOWEST_KEY
         values = np.maximum(np.nan_to_num(from_keys(levels).astype(np.float32), posinf=65504), 0)
-        self._sigma_at = _key_sigma(noise)
+        self._sigma_at = _KeySigma(noise)
         sigma = self._sigma_at(values)
         middle = levels - _THIRD_HIGHEST * sigma
         self._lit_low = _to_int16(middle - _LIT * sigma)
@@ -216,7 +216,7 @@ class RobustPlates:
         )
 
 
-class _key_sigma:  # noqa: N801
+class _KeySigma:
     """Standard deviation of a gray key at a gray value."""
 
     def __init__(self, noise: NoiseModel) -> None:

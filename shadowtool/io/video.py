@@ -1,6 +1,5 @@
 """Movies and cameras, decoded at the depth that they were stored with."""
 
-import logging
 import re
 import time
 from collections.abc import Iterator
@@ -15,8 +14,6 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from shadowtool.errors import DamagedFileError, InputError
-
-logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 

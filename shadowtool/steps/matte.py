@@ -137,16 +137,11 @@ def matte(
         image[bad] = np.nan
         exposure = 1.0 if gain == "none" else frame_gain(on_grid(image, step), reference)
         image = without_gain(image, exposure).astype(np.float32)
+        projected = shadow_beta.shadow_matte(image, scene.lit, scene.shadow)
         if "alpha" in given:
             coverage = np.clip(_matte_plane(given["alpha"].path(frame)), 0, 1)
         else:
-            distance = figure_distance(
-                image,
-                shadow_beta.shadow_matte(image, scene.lit, scene.shadow),
-                scene.lit,
-                scene.shadow,
-                noise,
-            )
+            distance = figure_distance(image, projected, scene.lit, scene.shadow, noise)
             if "trimap" in given:
                 regions = _trimap_plane(given["trimap"].path(frame))
             else:
@@ -160,7 +155,7 @@ def matte(
         if beta == "rgb":
             planes = np.moveaxis(shadow_beta.coloured_matte(image, scene.lit, scene.shadow), -1, 0)
         else:
-            planes = shadow_beta.shadow_matte(image, scene.lit, scene.shadow)[np.newaxis]
+            planes = projected[np.newaxis]
         filled_planes = []
         unknown = np.zeros(hidden.shape, bool)
         for plane, own_contrast in zip(planes, contrasts, strict=True):

@@ -64,8 +64,8 @@ def plate(
 ) -> Result:
     """Write ``lit.exr``, ``shadow.exr`` and ``confidence.exr``.
 
-    Memory does not depend on the number of frames. All are read once, and a fixed number of them
-    once more, before that.
+    Memory does not depend on the number of frames. All are read once; for ``robust``, or to find
+    the figure, a fixed number of them once more, before that.
 
     Args:
         holdout: a matte, roto or trimap sequence; where it is above 0 the pixel is out. "auto"
@@ -222,7 +222,7 @@ class _Take:
                     marks.append(matte.fingerprint)
                     holdout = matte.plane("A", "Y", "R")
                 elif self.background is not None:
-                    holdout = self.automatic(values)
+                    holdout = self.automatic(on_grid(values, self.step))
                     if keep:
                         write_png(_place(self.folder, frame), holdout, self.provenance)
             except InputError:
@@ -235,10 +235,10 @@ class _Take:
 
         yield from ordered_map(read, frames, self.run.jobs)
 
-    def automatic(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """The automatic holdout of a frame, (H, W) uint8."""
+    def automatic(self, grid: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """The automatic holdout, (H, W) uint8, of a frame's pixels on the grid."""
         assert self.background is not None
-        mask = figure_mask(on_grid(values, self.step), self.background)
+        mask = figure_mask(grid, self.background)
         return full_size(mask, *self.footage.header.size, self.step)
 
     def all_shown(
@@ -312,8 +312,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
             continue
         seen = keys.seen
         if take.background is not None:
-            mask = figure_mask(grid, take.background)
-            free = full_size(mask, *take.footage.header.size, take.step) == 0
+            free = take.automatic(grid) == 0
             seen = free if seen is None else seen & free
         levels.add(keys._replace(seen=seen))
     # Those whose exposure is off are read again, now that by how much is known.
@@ -324,12 +323,16 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
 
 
 def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
-    """Eq. (4), in one reading of all the frames."""
-    sampled = _sample(take, frames, automatic, with_levels=False)
+    """Eq. (4), in one reading of all the frames; only a figure to find takes another."""
+    begun = _sample(take, frames, automatic, with_levels=False).count if automatic else 0
+    numbers = {position: number for number, position in sample_positions(len(frames)).items()}
+    thinned: dict[int, NDArray[np.float32]] = {}
     extremes = ExtremePlates()
-    for _, item in take.all_shown(frames, with_keys=False, begun=sampled.count):
+    for position, item in take.all_shown(frames, with_keys=False, begun=begun):
         extremes.add(item.values, item.holdout)
-    return _Estimate(extremes.plates(), sampled.noise, {})
+        if position in numbers:
+            thinned[numbers[position]] = thin(item.values)
+    return _Estimate(extremes.plates(), noise_model(noise_levels(thinned)), {})
 
 
 def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | None) -> _Estimate:

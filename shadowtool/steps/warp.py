@@ -1,6 +1,5 @@
 """The displacement map from scans, and frames seen through it."""
 
-import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,8 +33,6 @@ from shadowtool.steps.run import (
     unchanged,
     write_manifest,
 )
-
-logger = logging.getLogger(__name__)
 
 PICTURE = "warp.png"
 

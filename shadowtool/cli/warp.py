@@ -28,7 +28,7 @@ from shadowtool.cli.options import step_command
 @click.option(
     "--iterations",
     type=click.IntRange(min=0, max=10_000),
-    default=20,
+    default=5,
     show_default=True,
     help="Steps of the diffusion that smooths the map.",
 )

@@ -134,6 +134,25 @@ def interpolate_lines(lines: ShadowLines, times: Float64) -> ShadowLines:
     return ShadowLines(times, normal, offset, residual, none, tuple(origin))
 
 
+def line_speed(lines: ShadowLines, shape: tuple[int, ...]) -> Float64:
+    """(F,) how fast the line moves over the picture, pixels a frame along its normal, ≥ 0.
+
+    Measured where the line passes nearest to the middle of a picture of ``shape`` (H, W).
+    """
+    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
+    distance = lines.normal @ middle + lines.offset
+    foot = middle - distance[:, None] * lines.normal
+    if len(lines) < 2:
+        return np.zeros(len(lines))
+    # From each line to the next, at the foot of the first.
+    step = np.abs((lines.normal[1:] * foot[:-1]).sum(axis=-1) + lines.offset[1:])
+    step /= np.diff(lines.frame)
+    speed = np.empty(len(lines))
+    speed[0], speed[-1] = step[0], step[-1]
+    speed[1:-1] = (step[:-1] + step[1:]) / 2
+    return speed
+
+
 def zero_crossings(
     time: NDArray[np.float32], plane: NDArray[np.bool_], frames: Float64
 ) -> dict[int, Float64]:

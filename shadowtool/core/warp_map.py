@@ -3,7 +3,7 @@
 ``warp[y, x] == (x, y)`` is the identity, which W is on the reference plane.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -17,8 +17,6 @@ Float64 = NDArray[np.float64]
 
 # Passes less far apart than this can't fix a point.
 LEAST_ANGLE = np.radians(10.0)
-# Standard deviation of a refined time, in frames: what rendered sweeps of sharp shadows show.
-_FRAME_SIGMA = 0.06
 _LEAST_WEIGHT = 1e-3
 
 
@@ -48,6 +46,11 @@ class Pass:
     times: ShadowTimes
     lines: ShadowLines
 
+    def part(self, rows: slice, columns: slice = slice(None)) -> "Pass":
+        """The same scan of a part of the picture; the lines keep the whole's coordinates."""
+        parts = {f.name: getattr(self.times, f.name)[rows, columns] for f in fields(self.times)}
+        return Pass(ShadowTimes(**parts), self.lines)
+
 
 def identity_map(height: int, width: int) -> Float32:
     """(H, W, 2) float32 with ``[y, x] == (x, y)``."""
@@ -55,7 +58,7 @@ def identity_map(height: int, width: int) -> Float32:
     return np.stack([x, y], axis=-1)
 
 
-def intersect(passes: list[Pass]) -> WarpMap:
+def intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
     """The weighted least squares intersection of the shadow lines through each pixel.
 
     Each pass contributes its line at t_s[p] with the weight w = c_s[p]² · exp(-E²), E the line's
@@ -63,6 +66,7 @@ def intersect(passes: list[Pass]) -> WarpMap:
 
     Args:
         passes: two or more, all of one size.
+        speeds: for each pass the speed of each of its lines, pixels a frame (`line_speed`).
 
     Returns:
         W; unknown where fewer than two passes that differ by `LEAST_ANGLE` reached the pixel.
@@ -75,7 +79,7 @@ def intersect(passes: list[Pass]) -> WarpMap:
     least_cosine = np.full(shape, np.inf)
     normals = []
     best = min(float(scan.lines.residual.min()) for scan in passes)
-    for scan in passes:
+    for scan, speed in zip(passes, speeds, strict=True):
         known = np.isfinite(scan.times.time)
         lines = interpolate_lines(scan.lines, scan.times.time[known].astype(np.float64))
         spans = np.isfinite(lines.offset)
@@ -87,8 +91,9 @@ def intersect(passes: list[Pass]) -> WarpMap:
         weight = scan.times.contrast[known].astype(np.float64) ** 2 * fit
         for row, term in zip(weighted, (nx * nx, nx * ny, ny * ny, nx * d, ny * d), strict=True):
             row[known] += weight * term
-        speed = np.interp(lines.frame[spans], scan.lines.frame, line_speed(scan.lines, shape))
-        precision = 1 / ((_FRAME_SIGMA * speed) ** 2 + residual**2 + 1e-4)
+        pace = np.interp(lines.frame[spans], scan.lines.frame, speed)
+        spread = scan.times.error[known] * pace
+        precision = 1 / (spread**2 + residual**2 + 1e-4)
         for row, term in zip(information, (nx * nx, nx * ny, ny * ny), strict=True):
             row[known] += precision * term
         normal = np.full((*shape, 2), np.nan)
@@ -112,25 +117,6 @@ def intersect(passes: list[Pass]) -> WarpMap:
         variance = (ia + ic) / (ia * ic - ib * ib)
         error[known] = np.sqrt(variance[known])
     return WarpMap(warp, error)
-
-
-def line_speed(lines: ShadowLines, shape: tuple[int, ...]) -> Float64:
-    """(F,) how fast the line moves over the picture, pixels a frame along its normal, ≥ 0.
-
-    Measured where the line passes nearest to the middle of a picture of ``shape`` (H, W).
-    """
-    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
-    distance = lines.normal @ middle + lines.offset
-    foot = middle - distance[:, None] * lines.normal
-    if len(lines) < 2:
-        return np.zeros(len(lines))
-    # From each line to the next, at the foot of the first.
-    step = np.abs((lines.normal[1:] * foot[:-1]).sum(axis=-1) + lines.offset[1:])
-    step /= np.diff(lines.frame)
-    speed = np.empty(len(lines))
-    speed[0], speed[-1] = step[0], step[-1]
-    speed[1:-1] = (step[:-1] + step[1:]) / 2
-    return speed
 
 
 def pass_angles(passes: list[Pass]) -> list[tuple[int, int, float]]:

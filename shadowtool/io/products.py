@@ -8,7 +8,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -106,7 +106,7 @@ def plate_layers(
 
 def write_scan(folder: Path, scan: Pass, header: Header, provenance: Provenance) -> None:
     """Write ``scan.exr`` and ``lines.json``."""
-    layers = {"time": scan.times.time, "contrast": scan.times.contrast}
+    layers = {part.name: getattr(scan.times, part.name) for part in fields(scan.times)}
     write_exr(folder / SCAN, layers, header, provenance)
     lines = scan.lines
     rows = [
@@ -136,11 +136,30 @@ def read_scan(folder: Path) -> tuple[Pass, Header, str]:
     image = read_image(folder / SCAN)
     data = read_bytes(folder / LINES)
     lines = _parse_lines(folder / LINES, data, image)
-    time, contrast = image.channel("time"), np.maximum(image.channel("contrast"), 0)
-    time = np.where(np.isfinite(time), time, np.float32(np.nan))
-    contrast = np.where(np.isfinite(contrast), contrast, np.float32(0))
-    scan = Pass(ShadowTimes(time, contrast), lines)
+    scan = Pass(_parse_times(image), lines)
     return scan, image.header, f"{image.fingerprint} {fingerprint(data)}"
+
+
+def _parse_times(image: Image) -> ShadowTimes:
+    """Times and errors; a scan of time and contrast alone knows each time to the interval."""
+    time, contrast = _time(image.channel("time")), image.channel("contrast")
+    contrast = np.where(np.isfinite(contrast), np.maximum(contrast, 0), np.float32(0))
+    if not {"error", "own_time", "own_error"} <= image.layers.keys():
+        return ShadowTimes.alone(time, contrast)
+    own_time = _time(image.channel("own_time"))
+    error, own_error = (
+        np.where((values := image.channel(name)) > 0, values, np.float32(np.inf))
+        for name in ("error", "own_error")
+    )
+    time[~np.isfinite(error)] = np.nan
+    own_time[~np.isfinite(own_error)] = np.nan
+    error[np.isnan(time)] = np.inf
+    own_error[np.isnan(own_time)] = np.inf
+    return ShadowTimes(time, error, contrast, own_time, own_error)
+
+
+def _time(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.where(np.isfinite(values), values, np.float32(np.nan))
 
 
 def _parse_lines(path: Path, data: bytes, image: Image) -> ShadowLines:

@@ -9,23 +9,26 @@ from numpy.typing import NDArray
 
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.pictures import time_picture
-from shadowtool.core.shadow_lines import NoLinesError, ShadowLines, fit_shadow_lines
+from shadowtool.core.plane_fits import reach
+from shadowtool.core.shadow_lines import NoLinesError, ShadowLines, fit_shadow_lines, line_speed
 from shadowtool.core.shadow_time import (
-    CrossingTimes,
+    CrossingFinder,
+    Crossings,
     LuminanceRange,
     ShadowTimes,
     least_contrast,
     luminance,
-    refine_times,
+    own_times,
+    refined_times,
     without_shade,
 )
-from shadowtool.core.warp_map import Pass, line_speed
+from shadowtool.core.warp_map import Pass
 from shadowtool.errors import DamagedFileError, InputError, ReshootError
 from shadowtool.io.files import fingerprint_file, make_folder
 from shadowtool.io.image import write_png
 from shadowtool.io.products import LINES, MANIFEST, SCAN, write_scan
 from shadowtool.io.sequence import Frame
-from shadowtool.parallel import ordered_map
+from shadowtool.parallel import bands, ordered_map
 from shadowtool.steps.footage import Footage, open_footage
 from shadowtool.steps.plane import read_plane
 from shadowtool.steps.run import (
@@ -82,7 +85,7 @@ def scan(
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
     noise = footage.measure_noise(run.jobs)
-    times, marks, used, first = _times(footage, frames, noise, region, run)
+    crossings, marks, used = _crossings(footage, frames, noise, run)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
     numbers = np.array([float(frame) for frame in used])
     if numbers[-1] > 2**20:
@@ -90,6 +93,7 @@ def scan(
             "%s: frame numbers this large leave float32 times few digits; renumber the take",
             footage.sequence.pattern,
         )
+    times = _times(crossings, noise, region, numbers, run.jobs)
     try:
         lines = fit_shadow_lines(times.time, region, numbers)
     except NoLinesError as error:
@@ -102,18 +106,15 @@ def scan(
     provenance = recipe.provenance(mark)
     make_folder(output)
     write_scan(output, Pass(times, lines), footage.header, provenance)
-    write_png(output / PICTURE, time_picture(first, times.time, lines, region), provenance)
+    picture = time_picture(footage.read(used[0]), times.time, lines, region)
+    write_png(output / PICTURE, picture, provenance)
     write_manifest(output, recipe, mark, figures)
     return Result("scan", output, used, 0, skipped, figures)
 
 
-def _times(
-    footage: Footage,
-    frames: list[Frame],
-    noise: NoiseModel,
-    region: NDArray[np.bool_],
-    run: Run,
-) -> tuple[ShadowTimes, list[str], list[Frame], NDArray[np.floating]]:
+def _crossings(
+    footage: Footage, frames: list[Frame], noise: NoiseModel, run: Run
+) -> tuple[Crossings, list[str], list[Frame]]:
     """Two readings of the pass: its range, then its crossings."""
 
     def read(frame: Frame) -> tuple[Float32, str] | None:
@@ -139,19 +140,53 @@ def _times(
     if span.lowest is None or span.highest is None or len(used) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
     least = least_contrast(span.highest, span.frames, noise)
-    crossings = CrossingTimes(span.lowest, span.highest, least)
-    for number, (frame, item) in enumerate(
+    finder = CrossingFinder(span.lowest, span.highest, least)
+    for number, (_, item) in enumerate(
         zip(used, ordered_map(read, used, run.jobs), strict=True), start=len(frames) + 1
     ):
         if item is not None:
-            crossings.add(float(frame), item[0])
+            finder.add(item[0])
         run.progress(number, total)
     run.progress(total, total)
-    times = without_shade(crossings.times(), span.highest, region)
-    numbers = np.array([float(frame) for frame in used])
-    refined = refine_times(times.time, numbers, crossings.sharpness)
-    times = ShadowTimes(refined, times.contrast)
-    return times, marks, used, footage.read(used[0])
+    return finder.found(), marks, used
+
+
+def _times(
+    crossings: Crossings,
+    noise: NoiseModel,
+    region: NDArray[np.bool_],
+    numbers: NDArray[np.float64],
+    jobs: int | None,
+) -> ShadowTimes:
+    """Times and errors, each pixel's own and as its neighbours tell them too."""
+    own, own_error = own_times(crossings, noise)
+    contrast = np.nan_to_num(crossings.highest - crossings.lowest)
+    lit = without_shade(contrast, crossings.highest, np.isfinite(own), region)
+    own, own_error = np.where(lit, own, np.nan), np.where(lit, own_error, np.inf)
+    time, error = np.empty_like(own), np.empty_like(own_error)
+
+    def refine(band: tuple[slice, slice]) -> tuple[slice, slice, tuple[Float32, Float32]]:
+        rows, inner = band
+        found = refined_times(own[rows], own_error[rows], crossings.at[rows])
+        return rows, inner, found
+
+    for rows, inner, found in ordered_map(refine, bands(len(own), reach()), jobs):
+        for whole, part in zip((time, error), found, strict=True):
+            whole[rows][inner] = part[inner]
+    # From positions among the frames to frame numbers, which may be further apart.
+    spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))
+    return ShadowTimes(
+        _numbers(time, numbers),
+        (error * spacing).astype(np.float32),
+        contrast,
+        _numbers(own, numbers),
+        (own_error * spacing).astype(np.float32),
+    )
+
+
+def _numbers(clock: Float32, numbers: NDArray[np.float64]) -> Float32:
+    """Positions among the frames to frame numbers, NaN kept."""
+    return np.interp(clock, np.arange(len(numbers)), numbers).astype(np.float32)
 
 
 def _figures(times: ShadowTimes, lines: ShadowLines, frames: list[Frame]) -> Figures:

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from shadowtool.core.diffusion import diffuse
+from shadowtool.core.epipole import Epipole
 from shadowtool.core.pictures import warp_picture
 from shadowtool.core.warp_map import (
     LEAST_ANGLE,
     Pass,
     WarpMap,
     identity_map,
-    intersect,
     pass_angles,
     resample,
 )
@@ -33,6 +33,7 @@ from shadowtool.steps.run import (
     unchanged,
     write_manifest,
 )
+from shadowtool.steps.solve import solve
 
 PICTURE = "warp.png"
 
@@ -45,7 +46,7 @@ def warp(
     map_file: Path | None = None,
     apply_to: str | Path | None = None,
     outside: float = 1.0,
-    iterations: int = 20,
+    iterations: int = 5,
 ) -> list[Result]:
     """Solve a map from scans, or take one that is there, and see frames through it.
 
@@ -111,14 +112,11 @@ def _solve(scans: list[Path], output: Path, run: Run, iterations: int) -> Result
             f"{scans[widest[0]]} and {scans[widest[1]]}: reshoot: the sweeps are only"
             f" {math.degrees(widest[2]):.1f} degrees apart; turn the stick by 45 or more"
         )
-    run.progress(0, 2)
-    measured = intersect(passes)
+    measured, epipole = solve(passes, run.jobs, run.progress)
     if not np.isfinite(measured.error).any():
         raise ReshootError(f"{output}: reshoot: no pixel was reached by two sweeps")
-    run.progress(1, 2)
     solved = diffuse(measured, iterations)
-    run.progress(2, 2)
-    figures = _figures(passes, measured, scans)
+    figures = _figures(passes, measured, scans, epipole)
     provenance = recipe.provenance(mark)
     make_folder(output)
     write_warp(output / WARP, solved, header, provenance)
@@ -191,7 +189,9 @@ def _scaled(warp_map: WarpMap, header: Header, source: Header) -> np.ndarray:
     return ((warp_map.warp + 0.5) * factor - 0.5).astype(np.float32)
 
 
-def _figures(passes: list[Pass], measured: WarpMap, scans: list[Path]) -> Figures:
+def _figures(
+    passes: list[Pass], measured: WarpMap, scans: list[Path], epipole: Epipole | None
+) -> Figures:
     names = [folder.resolve().name for folder in scans]
     known = np.isfinite(measured.error)
     error = measured.error[known]
@@ -212,6 +212,13 @@ def _figures(passes: list[Pass], measured: WarpMap, scans: list[Path]) -> Figure
         "predicted_error": {
             "median": round(float(np.median(error)), 3),
             "p90": round(float(np.percentile(error, 90)), 3),
+        },
+        "light": None
+        if epipole is None
+        else {
+            # Beyond this it may as well lie at infinity.
+            "at": [round(float(v), 1) for v in np.clip(epipole.position, -1e6, 1e6)],
+            "missed_by": round(epipole.miss, 3),
         },
         "displacement": {
             "median": round(float(np.median(displacement)), 3),

@@ -3,15 +3,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowtool.core.shadow_lines import fit_shadow_lines
+from shadowtool.core.shadow_lines import fit_shadow_lines, line_speed
 from shadowtool.core.shadow_time import ShadowTimes
 from shadowtool.core.warp_map import (
     Pass,
+    WarpMap,
     error_of_confidence,
     from_st_map,
     identity_map,
     intersect,
-    line_speed,
     pass_angles,
     resample,
     to_st_map,
@@ -29,15 +29,19 @@ def passes(angles: tuple[float, ...] = ANGLES) -> list[Pass]:
         time = edge_times(sweep)
         frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
         lines = fit_shadow_lines(time, SCENE.plane, frames)
-        result.append(Pass(ShadowTimes(time, np.ones_like(time)), lines))
+        result.append(Pass(ShadowTimes.alone(time, np.ones_like(time), 0.02), lines))
     return result
+
+
+def intersected(scans: list[Pass]) -> WarpMap:
+    return intersect(scans, [line_speed(scan.lines, (SCENE.height, SCENE.width)) for scan in scans])
 
 
 @pytest.mark.parametrize("angles", [(0.2, 1.7), ANGLES, (0.1, 0.9, 1.7, 2.5, 4.0)])
 def test_w_is_the_identity_on_the_plane_and_the_displacement_on_the_block(
     angles: tuple[float, ...],
 ) -> None:
-    solved = intersect(passes(angles))
+    solved = intersected(passes(angles))
     known = np.isfinite(solved.error)
     assert known.mean() > 0.85
     error = np.linalg.norm(solved.warp - SCENE.warp, axis=-1)
@@ -50,22 +54,21 @@ def test_two_passes_are_needed() -> None:
     one.times.time[:, :80] = np.nan
     two.times.time[:, :80] = np.nan
     three.times.time[:30] = np.nan
-    solved = intersect([one, two, three])
+    solved = intersected([one, two, three])
     assert np.isinf(solved.error[:, :80]).all()
     assert np.isnan(solved.warp[:, :80]).all()
     assert np.isfinite(solved.error[:30, 85:]).mean() > 0.5
 
 
 def test_near_parallel_passes_fix_nothing() -> None:
-    assert np.isinf(intersect(passes((0.2, 0.25))).error).all()
+    assert np.isinf(intersected(passes((0.2, 0.25))).error).all()
 
 
 def test_a_pass_of_low_contrast_counts_less() -> None:
     one, two, three = passes()
-    late = Pass(
-        ShadowTimes(three.times.time + 1, np.full_like(three.times.time, 0.01)), three.lines
-    )
-    solved = intersect([one, two, late])
+    faint = np.full_like(three.times.time, 0.01)
+    late = Pass(ShadowTimes.alone(three.times.time + 1, faint), three.lines)
+    solved = intersected([one, two, late])
     known = np.isfinite(solved.error)
     assert np.percentile(np.linalg.norm(solved.warp - SCENE.warp, axis=-1)[known], 95) < 0.1
 

@@ -67,7 +67,13 @@ def example_lines(count: int = 4) -> ShadowLines:
 def example_scan() -> Pass:
     time = 1001 + random(HEIGHT, WIDTH)
     time[0, 0] = np.nan
-    return Pass(ShadowTimes(time, random(HEIGHT, WIDTH, seed=2)), example_lines())
+    own = np.round(time, 1).astype(np.float32)
+    error, own_error = (
+        np.where(np.isfinite(time), values + np.float32(0.1), np.inf).astype(np.float32)
+        for values in (random(HEIGHT, WIDTH, seed=3), random(HEIGHT, WIDTH, seed=4))
+    )
+    contrast = random(HEIGHT, WIDTH, seed=2)
+    return Pass(ShadowTimes(time, error, contrast, own, own_error), example_lines())
 
 
 @pytest.fixture

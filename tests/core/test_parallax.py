@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+
+from shadowtool.core.epipole import find_epipole
+from shadowtool.core.parallax import measure_parallax
+from shadowtool.core.shadow_lines import line_speed
+from shadowtool.core.shadow_time import ShadowTimes
+from shadowtool.core.warp_map import Pass, identity_map
+from tests.core.test_shadow_lines import SCENE
+from tests.core.test_warp_map import passes
+
+POSITIONS = identity_map(SCENE.height, SCENE.width)
+# The block's displacement is (6, -9) everywhere: its light is infinitely far.
+LENGTH = float(np.hypot(*SCENE.displacement))
+DIRECTIONS = np.broadcast_to(
+    np.float32(SCENE.displacement) / np.float32(LENGTH), POSITIONS.shape
+).copy()
+
+
+def measured(scans: list[Pass]) -> tuple[np.ndarray, np.ndarray]:
+    speeds = [line_speed(scan.lines, (SCENE.height, SCENE.width)) for scan in scans]
+    return measure_parallax(scans, POSITIONS, DIRECTIONS, speeds)
+
+
+@pytest.mark.parametrize("angles", [(0.2, 1.7), (0.2, 1.3, 2.4)])
+def test_s_is_0_on_the_plane_and_the_length_of_the_displacement_on_the_block(
+    angles: tuple[float, ...],
+) -> None:
+    shift, error = measured(passes(angles))
+    known = np.isfinite(error)
+    assert known.mean() > 0.85
+    truth = np.where(SCENE.plane, 0, LENGTH)
+    assert np.percentile(np.abs(shift - truth)[known], 99) < 0.15
+
+
+def test_two_passes_are_needed_to_check_each_other() -> None:
+    one, two, three = passes()
+    for scan in (two, three):
+        scan.times.own_time[:, :80] = np.nan
+    shift, error = measured([one, two, three])
+    assert np.isnan(shift[:, :80]).all() and np.isinf(error[:, :80]).all()
+    assert np.isfinite(error[:, 90:]).mean() > 0.7
+
+
+def test_a_pass_that_disagrees_is_outvoted_by_two_that_agree() -> None:
+    one, two, three = passes()
+    late = Pass(ShadowTimes.alone(three.times.time + 4, three.times.contrast, 0.02), three.lines)
+    honest, _ = measured([one, two])
+    shift, error = measured([one, two, late])
+    known = np.isfinite(error) & np.isfinite(honest)
+    assert np.percentile(np.abs(shift - honest)[known], 95) < 0.05
+
+
+def test_two_passes_that_disagree_are_known_badly() -> None:
+    one, two = passes((0.2, 1.7))
+    late = Pass(ShadowTimes.alone(two.times.time + 4, two.times.contrast, 0.02), two.lines)
+    both = (np.isfinite(m[1]) for m in (measured([one, two]), measured([one, late])))
+    known = np.logical_and(*both)
+    assert np.median(measured([one, late])[1][known]) > 5 * np.median(
+        measured([one, two])[1][known]
+    )
+
+
+def test_a_pass_along_the_displacement_measures_nothing() -> None:
+    # Its lines run in the direction of the displacement: the normal is square to that.
+    along = float(np.arctan2(SCENE.displacement[1], SCENE.displacement[0])) + np.pi / 2
+    shift, error = measured(passes((along, 1.3)))
+    assert np.isinf(error).all() and np.isnan(shift).all()
+
+
+def test_the_light_of_the_scene_is_found_in_its_own_displacements() -> None:
+    found = find_epipole(SCENE.warp, np.full(SCENE.plane.shape, 0.05, np.float32), POSITIONS)
+    assert found is not None
+    assert np.abs((found.directions(POSITIONS) * DIRECTIONS).sum(axis=-1)) == pytest.approx(
+        1, abs=1e-4
+    )
+
+
+def test_inputs_are_left_alone() -> None:
+    scans = passes()
+    before = [scan.times.own_time.copy() for scan in scans]
+    measured(scans)
+    for scan, kept in zip(scans, before, strict=True):
+        assert np.array_equal(scan.times.own_time, kept, equal_nan=True)

@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shadowtool.core.plane_fits import RADII, fit_planes, radii_for, reach
+
+ROWS, COLUMNS = np.mgrid[:60, :80].astype(np.float64)
+
+
+def measured(truth: np.ndarray, error: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    value = truth + rng.normal(scale=error, size=truth.shape)
+    return value.astype(np.float32), np.full(truth.shape, error, np.float32)
+
+
+def by_hand(
+    value: np.ndarray, error: np.ndarray, row: int, column: int, radius: int
+) -> tuple[float, float]:
+    """A plane's value at the middle of a window, and its variance, by plain least squares."""
+    window = (
+        slice(row - radius, row + radius + 1),
+        slice(column - radius, column + radius + 1),
+    )
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    design = np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=1)
+    weight = 1 / error[window].ravel().astype(np.float64) ** 2
+    normal = design.T @ (design * weight[:, None]) + np.diag([1e-9, 0.1, 0.1])
+    solved = np.linalg.solve(normal, design.T @ (weight * value[window].ravel()))
+    return float(solved[0]), float(np.linalg.inv(normal)[0, 0])
+
+
+def test_a_single_centred_window_is_plain_least_squares() -> None:
+    value, error = measured(0.02 * COLUMNS, 0.3)
+    error *= np.random.default_rng(1).uniform(0.8, 1.2, error.shape).astype(np.float32)
+    fitted, spread = fit_planes(value, error, (3,))
+    for row, column in ((0, 0), (30, 40), (41, 17)):
+        # Of a window's pixels the middle is known best: elsewhere the window is shifted.
+        inside = (slice(row, row + 1), slice(column, column + 1))
+        assert np.isfinite(fitted[inside]).all()
+    plane, variance = by_hand(value, error, 30, 40, 3)
+    if spread[30, 40] ** 2 == pytest.approx(variance + 0.02**2, rel=0.02):
+        assert fitted[30, 40] == pytest.approx(plane, abs=1e-4)
+    assert (spread < 0.7 * error).mean() > 0.9
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3, -2.0])
+def test_a_plane_is_found_as_well_as_predicted(slope: float) -> None:
+    truth = 3 + slope * COLUMNS - 0.5 * slope * ROWS
+    value, error = measured(truth, 0.5)
+    fitted, spread = fit_planes(value, error)
+    assert np.median(np.abs(fitted - truth)) < 0.06
+    assert np.percentile(np.abs(fitted - truth) / spread, 90) < 3
+
+
+def test_a_step_stays_where_it_is() -> None:
+    truth = np.where(COLUMNS < 37, 0.1 * ROWS, 12 - 0.2 * COLUMNS)
+    value, error = measured(truth, 0.4)
+    fitted, _ = fit_planes(value, error)
+    off = np.abs(fitted - truth)
+    assert np.percentile(off, 99) < 0.6
+    assert off[:, 34:40].mean() < 0.25
+
+
+def test_what_is_known_well_leads() -> None:
+    # Times of an edge that moves 9 pixels a frame: a few are caught, of the others nothing but the
+    # interval is known, so that their middle is off by up to half a frame.
+    truth = 0.1 * COLUMNS + 0.05 * ROWS
+    caught = np.random.default_rng(0).uniform(size=truth.shape) < 0.2
+    value = np.where(caught, truth, np.floor(truth) + 0.5).astype(np.float32)
+    error = np.where(caught, 0.02, 12**-0.5).astype(np.float32)
+    fitted, spread = fit_planes(value, error)
+    assert np.percentile(np.abs(fitted - truth), 95) < 0.1
+    assert np.median(spread) < 0.05
+
+
+def test_a_lone_wrong_measurement_is_replaced() -> None:
+    value, error = measured(np.zeros_like(ROWS), 0.1)
+    value[20, 30] = 40.0
+    fitted, _ = fit_planes(value, error)
+    assert abs(fitted[20, 30]) < 0.2
+    assert np.abs(fitted).max() < 0.5
+
+
+def test_unknown_stays_unknown_and_does_not_count() -> None:
+    value, error = measured(0.2 * ROWS, 0.1)
+    value[10:20, 10:20] = np.nan
+    error[10:20, 10:20] = np.inf
+    before = value.copy()
+    fitted, spread = fit_planes(value, error)
+    assert np.array_equal(np.isnan(fitted), np.isnan(value))
+    assert np.isinf(spread[10:20, 10:20]).all()
+    assert np.array_equal(value, before, equal_nan=True)
+
+
+def test_bands_of_the_picture_give_the_same() -> None:
+    value, error = measured(np.hypot(ROWS, COLUMNS), 0.5)
+    whole, spread = fit_planes(value, error)
+    first = 30
+    part, part_spread = fit_planes(value[first - reach() :], error[first - reach() :])
+    assert np.array_equal(part[reach() :], whole[first:])
+    assert np.array_equal(part_spread[reach() :], spread[first:])
+
+
+def test_windows_grow_with_the_step() -> None:
+    assert radii_for(10) == RADII
+    assert radii_for(40)[: len(RADII)] == RADII and 20 < radii_for(40)[-1] < 45
+    assert radii_for(1e6)[-1] < 80
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.integers(1, 20),
+    st.integers(1, 20),
+    st.floats(0, 1),
+    st.integers(0, 2**32 - 1),
+)
+def test_any_picture_gives_one_of_its_size(
+    height: int, width: int, unknown: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    value = rng.uniform(-100, 100, (height, width)).astype(np.float32)
+    value[rng.uniform(size=value.shape) < unknown] = np.nan
+    error = np.where(np.isnan(value), np.inf, rng.uniform(0.01, 10, value.shape)).astype(np.float32)
+    fitted, spread = fit_planes(value, error)
+    assert fitted.shape == spread.shape == value.shape
+    assert fitted.dtype == spread.dtype == np.float32
+    assert np.isnan(fitted[np.isnan(value)]).all()
+    assert np.array_equal(np.isfinite(fitted), np.isfinite(spread))
+    assert (spread > 0).all()

@@ -936,12 +936,23 @@ def planes_422(code: Array) -> list[Array]:
     return [np.clip(plane, 4, 1019).astype("<u2") for plane in planes]
 
 
-def write_movie(path: Path, frames: Iterable[Array], crf: float) -> None:
-    """Encode linear frames as H.264 High 4:2:2, 10 bit, tagged BT.709 and limited range."""
+def planes_420(code: Array) -> list[Array]:
+    """Y, Cb and Cr in 8 bit limited range, colour at every second column and between rows."""
+    y, *chroma = (plane.astype(float) / 4.0 for plane in planes_422(code))
+    planes = [y, *((c[::2] + c[1::2]) / 2.0 for c in chroma)]
+    return [np.round(plane).astype("u1") for plane in planes]
+
+
+def write_movie(path: Path, frames: Iterable[Array], crf: float, small: bool = False) -> None:
+    """Encode linear frames as H.264, tagged BT.709 and limited range: High 4:2:2 of 10 bit, or
+    small, 4:2:0 of 8 bit."""
+    layout, code_of, kind = (
+        ("yuv420p", planes_420, "u1") if small else ("yuv422p10le", planes_422, "<u2")
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=FPS)
-        stream.pix_fmt = "yuv422p10le"
+        stream.pix_fmt = layout
         stream.time_base = Fraction(1, FPS)
         stream.options = {
             "crf": f"{crf:g}",
@@ -959,10 +970,10 @@ def write_movie(path: Path, frames: Iterable[Array], crf: float) -> None:
             height, width = image.shape[:2]
             if number == 0:
                 stream.width, stream.height = width, height
-            frame = av.VideoFrame(width, height, "yuv422p10le")
-            for plane, values in zip(frame.planes, planes_422(encode_709(image)), strict=True):
+            frame = av.VideoFrame(width, height, layout)
+            for plane, values in zip(frame.planes, code_of(encode_709(image)), strict=True):
                 # The rows of a plane may be padded.
-                rows = np.zeros((plane.height, plane.line_size // 2), "<u2")
+                rows = np.zeros((plane.height, plane.line_size // np.dtype(kind).itemsize), kind)
                 rows[:, : plane.width] = values
                 plane.update(rows)
             frame.color_primaries = ColorPrimaries.BT709

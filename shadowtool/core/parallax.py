@@ -36,7 +36,7 @@ def measure_parallax(
 
     Returns:
         s and its standard deviation, pixels, (H, W) float32 each; NaN and infinite where fewer than
-        two passes measure it.
+        two passes reached the pixel, or none measures it.
     """
     measured = [
         _one(scan, positions, directions, speed) for scan, speed in zip(passes, speeds, strict=True)
@@ -44,13 +44,14 @@ def measure_parallax(
     shift = np.stack([m[0] for m in measured])
     weight = np.stack([m[1] for m in measured])
     weight = _without_outvoted(shift, weight)
+    reached = np.sum([m[2] for m in measured], axis=0)
     count = (weight > 0).sum(axis=0)
     total = weight.sum(axis=0)
     safe = np.maximum(total, 1e-12)
     mean = (weight * shift).sum(axis=0) / safe
     scatter = (weight * (shift - mean) ** 2).sum(axis=0) / np.maximum(count - 1, 1)
     variance = np.maximum(scatter / _AGREE, 1) / safe
-    known = count >= 2
+    known = (reached >= 2) & (count > 0)
     return (
         np.where(known, mean, np.nan).astype(np.float32),
         np.where(known, np.sqrt(variance), np.inf).astype(np.float32),
@@ -59,8 +60,9 @@ def measure_parallax(
 
 def _one(
     scan: Pass, positions: Float32, directions: Float32, speed: Float64
-) -> tuple[Float64, Float64]:
-    """One pass's s and the inverse of its variance; 0 and 0 where it has none."""
+) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+    """One pass's s, the inverse of its variance, which is 0 where it measures none, and which
+    pixels it reached."""
     time, error = scan.times.own_time, scan.times.own_error
     known = np.isfinite(time)
     lines = interpolate_lines(scan.lines, time[known].astype(np.float64))
@@ -76,7 +78,7 @@ def _one(
     shift, weight = np.zeros(time.shape), np.zeros(time.shape)
     shift[known] = np.where(usable, distance / across, 0)
     weight[known] = np.where(usable, across**2 / variance, 0)
-    return shift, weight
+    return shift, weight, known
 
 
 def _without_outvoted(shift: Float64, weight: Float64) -> Float64:

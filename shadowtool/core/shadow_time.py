@@ -21,8 +21,12 @@ Bool = NDArray[np.bool_]
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 # A value between dark and lit was caught on its way if it is off both by so many standard
-# deviations, and by this part of the contrast: light flickers, and footage is compressed.
+# deviations, and by a part of the contrast, this one at least: light flickers, and a codec's errors
+# are largest where something has just changed.
 _CAUGHT, _LEAST_CAUGHT = 3.0, 0.04
+# Parts of the contrast by which values are counted, where they are on their way for certain, and
+# how many times as often as there a value may occur that is.
+_BINS, _CERTAIN, _TOO_OFTEN = 50, 0.2, 2.0
 # Half the window in which an edge is taken to last equally long, pixels.
 _LOCAL = 15
 # How well an edge's profile is known, as a part of its duration; and the least error, frames.
@@ -199,8 +203,8 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
     with np.errstate(invalid="ignore"):
         lost = np.clip((lit - crossings.before) / contrast, 0, 1)
         left = np.clip((crossings.after - dark) / contrast, 0, 1)
-    caught_before = known & (lost > np.maximum(_CAUGHT * lit_sigma, _LEAST_CAUGHT))
-    caught_after = known & (left > np.maximum(_CAUGHT * dark_sigma, _LEAST_CAUGHT))
+    caught_before = known & (lost > np.maximum(_CAUGHT * lit_sigma, _least_caught(lost[known])))
+    caught_after = known & (left > np.maximum(_CAUGHT * dark_sigma, _least_caught(left[known])))
     lost, left = np.where(caught_before, lost, 0), np.where(caught_after, left, 0)
     duration = 6 * _local_mean(lost * (1 - lost) + left * (1 - left), known)
     sharp = np.minimum(duration, 1)
@@ -257,6 +261,20 @@ def without_shade(contrast: Float32, highest: Float32, known: Bool, plane: Bool)
         return known
     with np.errstate(invalid="ignore"):
         return np.asarray(known & ~(part < _SHADE * np.median(usual)))
+
+
+def _least_caught(part: Float32) -> float:
+    """Below which part of the contrast a value may well be an error and no edge on its way.
+
+    A flank passes all values about equally fast; where far more pixels have a value than that, most
+    of them were lit or dark.
+    """
+    counts, edges = np.histogram(part, bins=_BINS, range=(0.0, 0.5))
+    certain = edges[:-1] >= _CERTAIN
+    often = counts > _TOO_OFTEN * max(float(np.median(counts[certain])), 1.0)
+    often[certain] = False
+    last = int(np.flatnonzero(often)[-1]) + 1 if often.any() else 0
+    return max(float(edges[last]), _LEAST_CAUGHT)
 
 
 def _sigma(gray: Float32, noise: NoiseModel) -> Float32:

@@ -73,7 +73,7 @@ SAMPLES = 100
 FIRST_FRAME = render.FIRST_FRAME
 WIDTH, HEIGHT = 480, 270
 REFERENCE_STEP = 10
-CRF = 5.0
+CRF, SMALL_CRF = 5.0, 18.0
 
 
 # Materials
@@ -662,14 +662,17 @@ def noisy_take(name: str, take: str, bench: Path | None = None) -> Path:
     return folder
 
 
-def movie(name: str, take: str, bench: Path | None = None) -> Path:
-    """A take's noisy frames as a 10 bit 4:2:2 movie, made at first use."""
-    path = scene_folder(name, bench) / "movies" / f"{take}.mov"
+def movie(name: str, take: str, bench: Path | None = None, small: bool = False) -> Path:
+    """A take's noisy frames as a 10 bit 4:2:2 movie, or small, of 8 bit and 4:2:0, made at first
+    use."""
+    path = scene_folder(name, bench) / "movies" / f"{take}{'.small' if small else ''}.mov"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
             made = Path(temporary) / path.name
-            render.write_movie(made, noisy_frames(name, take, bench), CRF)
+            render.write_movie(
+                made, noisy_frames(name, take, bench), SMALL_CRF if small else CRF, small
+            )
             made.rename(path)
     return path
 

@@ -61,11 +61,14 @@ def test_two_passes_that_disagree_are_known_badly() -> None:
     )
 
 
-def test_a_pass_along_the_displacement_measures_nothing() -> None:
+def test_a_pass_along_the_displacement_leaves_the_measuring_to_the_other() -> None:
     # Its lines run in the direction of the displacement: the normal is square to that.
     along = float(np.arctan2(SCENE.displacement[1], SCENE.displacement[0])) + np.pi / 2
     shift, error = measured(passes((along, 1.3)))
-    assert np.isinf(error).all() and np.isnan(shift).all()
+    known = np.isfinite(error)
+    assert known.mean() > 0.7
+    truth = np.where(SCENE.plane, 0, LENGTH)
+    assert np.percentile(np.abs(shift - truth)[known], 95) < 0.15
 
 
 def test_the_light_of_the_scene_is_found_in_its_own_displacements() -> None:

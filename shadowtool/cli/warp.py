@@ -17,6 +17,14 @@ from shadowtool.cli.options import step_command
     metavar="FILE",
     help="Use this ST map instead of solving one from scans.",
 )
+@click.option(
+    "--source-scan",
+    "source_scans",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="SCAN",
+    help="A scan of the source, for a source that isn't flat; give two or more.",
+)
 @click.option("--apply", "apply_to", metavar="FRAMES", help="Warp these frames, e.g. β.")
 @click.option(
     "--outside",
@@ -33,7 +41,9 @@ from shadowtool.cli.options import step_command
     help="Steps of the diffusion that smooths the map.",
 )
 @step_command
-def command(scans: tuple[Path, ...], output: Path, **options: Any) -> list[Any]:
+def command(
+    scans: tuple[Path, ...], output: Path, source_scans: tuple[Path, ...], **options: Any
+) -> list[Any]:
     """Solve where in the source plane each target pixel's shadow comes from, from its scans.
 
     Writes warp.exr, an ST map (R G = u v, A = confidence) as Nuke and Natron read it, and
@@ -41,4 +51,4 @@ def command(scans: tuple[Path, ...], output: Path, **options: Any) -> list[Any]:
     """
     from shadowtool.steps.warp import warp
 
-    return warp(list(scans), output, **options)
+    return warp(list(scans), output, source_scans=list(source_scans), **options)

@@ -8,6 +8,7 @@ import numpy as np
 
 from shadowtool.core.diffusion import diffuse
 from shadowtool.core.epipole import Epipole
+from shadowtool.core.inverse_map import compose, invert
 from shadowtool.core.pictures import warp_picture
 from shadowtool.core.warp_map import (
     LEAST_ANGLE,
@@ -33,9 +34,13 @@ from shadowtool.steps.run import (
     unchanged,
     write_manifest,
 )
-from shadowtool.steps.solve import solve
+from shadowtool.steps.solve import Solved, solve
 
 PICTURE = "warp.png"
+
+# Maps of which less of the frame is measured, or of which half is predicted to be off by more
+# pixels, are of no use.
+_LEAST_KNOWN, _WORST_ERROR = 0.05, 8.0
 
 
 def warp(
@@ -44,6 +49,7 @@ def warp(
     *,
     run: Run = Run(),
     map_file: Path | None = None,
+    source_scans: list[Path] | None = None,
     apply_to: str | Path | None = None,
     outside: float = 1.0,
     iterations: int = 5,
@@ -57,6 +63,8 @@ def warp(
     Args:
         scans: two or more folders of `scan`; none with ``map_file``.
         map_file: an ST map.
+        source_scans: two or more scans of the source, if that isn't flat: the map then leads on
+            from the reference plane to where the source shows the shadow.
         apply_to: frames to warp.
         outside: the value where the map points outside the frame; 1 is lit.
         iterations: of the diffusion; 0 only fills.
@@ -75,52 +83,106 @@ def warp(
         raise OptionError("--map FILE needs --apply FRAMES")
     if map_file is None and len(scans) < 2:
         raise OptionError("a map takes two scans or more, swept at different angles")
+    if source_scans and map_file is not None:
+        raise OptionError("--source-scan goes with SCAN folders, not with --map")
+    if source_scans and len(source_scans) < 2:
+        raise OptionError("give --source-scan twice or more, for sweeps at different angles")
     applied = None if apply_to is None else _open_frames(apply_to, output, run)
     if map_file is not None:
         assert applied is not None
         # A folder in which a map was solved keeps the record of that.
         record_in = applied.folder if is_file(output / WARP) else output
         return [_apply(map_file, applied, record_in, run, outside)]
-    results = [_solve(scans, output, run, iterations)]
+    results = [_solve(scans, source_scans or [], output, run, iterations)]
     if applied is not None:
         folder = output / applied.sequence.name
         results.append(_apply(output / WARP, applied, folder, run, outside))
     return results
 
 
-def _solve(scans: list[Path], output: Path, run: Run, iterations: int) -> Result:
-    read = [read_scan(folder) for folder in scans]
-    header = read[0][1]
-    for folder, (_, other, _) in zip(scans, read, strict=True):
-        require_size(folder, other, header, str(scans[0]))
+@dataclass(frozen=True)
+class _Scans:
+    """The passes of one set, the target's or the source's."""
+
+    folders: list[Path]
+    passes: list[Pass]
+    header: Header
+    marks: list[str]
+
+    @property
+    def names(self) -> list[str]:
+        return [folder.resolve().name for folder in self.folders]
+
+    def require_angles(self) -> None:
+        """Refuse sweeps that run in nearly the same direction."""
+        one, other, widest = max(pass_angles(self.passes), key=lambda row: row[2])
+        if widest < LEAST_ANGLE:
+            raise ReshootError(
+                f"{self.folders[one]} and {self.folders[other]}: reshoot: the sweeps are only"
+                f" {math.degrees(widest):.1f} degrees apart; turn the stick by 45 or more"
+            )
+
+    def solve(self, run: Run, output: Path) -> Solved:
+        """W as the passes measure it; refused if they hardly do."""
+        solved = solve(self.passes, run.jobs, run.progress)
+        known = np.isfinite(solved.warp_map.error)
+        if known.mean() < _LEAST_KNOWN:
+            raise ReshootError(
+                f"{output}: reshoot: two sweeps reached only {known.mean():.1%} of the frame"
+                f" ({', '.join(self.names)}); let every sweep cross all of it"
+            )
+        error = float(np.median(solved.warp_map.error[known]))
+        if error > _WORST_ERROR:
+            raise ReshootError(
+                f"{output}: reshoot: the map would be off by {error:.1f} pixels"
+                f" ({', '.join(self.names)}); sweep more slowly, with a straighter edge"
+            )
+        return solved
+
+
+def _open_scans(folders: list[Path], beside: tuple[Header, str] | None = None) -> _Scans:
+    read = [read_scan(folder) for folder in folders]
+    header, name = beside or (read[0][1], str(folders[0]))
+    for folder, (_, other, _) in zip(folders, read, strict=True):
+        require_size(folder, other, header, name)
+    return _Scans(folders, [row[0] for row in read], read[0][1], [row[2] for row in read])
+
+
+def _solve(
+    scans: list[Path], source_scans: list[Path], output: Path, run: Run, iterations: int
+) -> Result:
+    target = _open_scans(scans)
+    source = _open_scans(source_scans, (target.header, str(scans[0]))) if source_scans else None
     refuse_existing([output / WARP, output / MANIFEST], run)
-    recipe = Recipe(
-        "warp",
-        {"iterations": iterations},
-        {f"scan {i}": folder.resolve().name for i, folder in enumerate(scans, start=1)},
-    )
-    mark = recipe.fingerprint(fingerprint for _, _, fingerprint in read)
+    inputs = {f"scan {i}": name for i, name in enumerate(target.names, start=1)}
+    marks = list(target.marks)
+    if source is not None:
+        inputs |= {f"source scan {i}": name for i, name in enumerate(source.names, start=1)}
+        marks += ["source", *source.marks]
+    recipe = Recipe("warp", {"iterations": iterations}, inputs)
+    mark = recipe.fingerprint(marks)
     if run.resume:
         figures = unchanged(output, [output / WARP, output / PICTURE], mark)
         if figures is not None:
             return Result("warp", output, [], 1, (), figures)
-    passes = [scan for scan, _, _ in read]
-    angles = pass_angles(passes)
-    widest = max(angles, key=lambda row: row[2])
-    if widest[2] < LEAST_ANGLE:
-        raise ReshootError(
-            f"{scans[widest[0]]} and {scans[widest[1]]}: reshoot: the sweeps are only"
-            f" {math.degrees(widest[2]):.1f} degrees apart; turn the stick by 45 or more"
-        )
-    measured, epipole = solve(passes, run.jobs, run.progress)
-    if not np.isfinite(measured.error).any():
-        raise ReshootError(f"{output}: reshoot: no pixel was reached by two sweeps")
-    solved = diffuse(measured, iterations)
-    figures = _figures(passes, measured, scans, epipole)
+    for every in (target, source):
+        if every is not None:
+            every.require_angles()
+    measured, epipole = target.solve(run, output)
+    result = diffuse(measured, iterations)
+    figures = _figures(target, measured, epipole)
+    if source is not None:
+        own, own_epipole = source.solve(run, output)
+        figures["source"] = _figures(source, own, own_epipole)
+        onward = invert(diffuse(own, iterations))
+        measured = compose(result, onward)
+        # Ground that the source's camera doesn't see is filled in from around it.
+        result = diffuse(measured, 0)
+        figures["source"]["seen"] = round(float(np.isfinite(measured.error).mean()), 4)
     provenance = recipe.provenance(mark)
     make_folder(output)
-    write_warp(output / WARP, solved, header, provenance)
-    write_png(output / PICTURE, _picture(passes, solved), provenance)
+    write_warp(output / WARP, result, target.header, provenance)
+    write_png(output / PICTURE, _picture(target.passes, result), provenance)
     write_manifest(output, recipe, mark, figures)
     return Result("warp", output, [], 0, (), figures)
 
@@ -189,10 +251,8 @@ def _scaled(warp_map: WarpMap, header: Header, source: Header) -> np.ndarray:
     return ((warp_map.warp + 0.5) * factor - 0.5).astype(np.float32)
 
 
-def _figures(
-    passes: list[Pass], measured: WarpMap, scans: list[Path], epipole: Epipole | None
-) -> Figures:
-    names = [folder.resolve().name for folder in scans]
+def _figures(scans: _Scans, measured: WarpMap, epipole: Epipole | None) -> Figures:
+    names, passes = scans.names, scans.passes
     known = np.isfinite(measured.error)
     error = measured.error[known]
     displacement = np.linalg.norm(

@@ -1,0 +1,128 @@
+"""From swept frames on disk to W, on the analytic scene."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shadowtool.core.warp_map import identity_map
+from shadowtool.errors import OptionError, ReshootError
+from shadowtool.io.image import Header, to_half, write_exr, write_png
+from shadowtool.io.products import WARP, read_scan, read_warp
+from shadowtool.steps.run import Run
+from shadowtool.steps.scan import scan
+from shadowtool.steps.warp import warp
+from tests.scene import Scene, Sweep
+
+SCENE = Scene()
+IDENTITY = identity_map(SCENE.height, SCENE.width)
+SWEEPS = {
+    "first": Sweep(0.3, speed=8.0, soft=1.0, width=30.0),
+    "second": Sweep(1.3, speed=9.0, soft=1.0, width=30.0),
+    "third": Sweep(2.5, speed=8.0, soft=1.0, width=30.0),
+}
+
+
+def shoot(folder: Path, sweep: Sweep) -> Path:
+    """The noisy frames of a sweep."""
+    header = Header(SCENE.width, SCENE.height)
+    folder.mkdir(parents=True)
+    for frame in range(SCENE.frames_of(sweep)):
+        image = SCENE.noisy(SCENE.image(SCENE.sweep_beta(sweep, frame)), frame)
+        write_exr(folder / f"take.{1001 + frame}.exr", {"RGB": to_half(image)}, header)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mask(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("mask") / "plane.png"
+    write_png(path, SCENE.plane.astype(np.uint8) * np.uint8(255))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory, mask: str) -> list[Path]:
+    work = tmp_path_factory.mktemp("sweeps")
+    made = []
+    for name, sweep in SWEEPS.items():
+        scan(shoot(work / "frames" / name, sweep), work / name, plane=mask)
+        made.append(work / name)
+    return made
+
+
+def test_lines_lie_within_a_fraction_of_a_pixel(scans: list[Path]) -> None:
+    for folder, sweep in zip(scans, SWEEPS.values(), strict=True):
+        lines = read_scan(folder)[0].lines
+        assert np.median(lines.residual) < 0.1
+        normal, offset = SCENE.edge(sweep, lines.frame[len(lines) // 2] - 1001)
+        found = lines.normal[len(lines) // 2], lines.offset[len(lines) // 2]
+        side = np.sign(found[0] @ normal)
+        assert side * found[0] == pytest.approx(normal, abs=0.003)
+        assert side * found[1] == pytest.approx(offset, abs=0.3)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_w_is_found_to_a_fraction_of_a_pixel(scans: list[Path], tmp_path: Path, count: int) -> None:
+    (result,) = warp(scans[:count], tmp_path)
+    found, _, _ = read_warp(tmp_path / WARP)
+    known = np.isfinite(found.error)
+    error = np.linalg.norm(found.warp - SCENE.warp, axis=-1)
+    assert known.mean() > 0.85
+    assert np.median(error[known & SCENE.plane]) < 0.1
+    assert np.median(error[known & ~SCENE.plane]) < 0.3
+    assert np.percentile(error[known], 90) < 0.6
+    sure = known & (found.error < 1)
+    assert (error[sure] < 1).mean() > 0.9
+    # The block's displacement is the same everywhere: its light is infinitely far away.
+    assert np.abs(result.figures["light"]["at"]).max() > 1000
+
+
+def test_a_source_that_stands_like_the_target_needs_no_map(
+    scans: list[Path], tmp_path: Path
+) -> None:
+    warp(scans, tmp_path, source_scans=scans)
+    found, _, _ = read_warp(tmp_path / WARP)
+    known = np.isfinite(found.error)
+    assert 0.7 < known.mean() < 1
+    error = np.linalg.norm(found.warp - IDENTITY, axis=-1)
+    assert np.median(error[known]) < 0.1
+    assert np.percentile(error[known], 90) < 1
+    assert np.isfinite(found.warp).all()
+
+
+def test_the_map_is_the_same_for_any_number_of_jobs(scans: list[Path], tmp_path: Path) -> None:
+    for jobs in (1, 3):
+        warp(scans, tmp_path / str(jobs), run=Run(jobs=jobs))
+    one, other = ((tmp_path / str(jobs) / WARP).read_bytes() for jobs in (1, 3))
+    assert one == other
+
+
+def test_a_single_source_scan_is_refused(scans: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="source-scan twice"):
+        warp(scans, tmp_path, source_scans=scans[:1])
+    assert not any(tmp_path.iterdir())
+
+
+def test_parallel_source_scans_are_to_be_shot_again(scans: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(ReshootError, match="degrees apart"):
+        warp(scans, tmp_path, source_scans=[scans[0], scans[0]])
+    assert not any(tmp_path.iterdir())
+
+
+def test_sweeps_that_hardly_meet_are_to_be_shot_again(tmp_path: Path, mask: str) -> None:
+    made = []
+    for name, region in (("left", slice(0, 80)), ("right", slice(78, None))):
+        sweep = SWEEPS["first" if name == "left" else "second"]
+        folder = tmp_path / "frames" / name
+        folder.mkdir(parents=True)
+        for frame in range(SCENE.frames_of(sweep)):
+            beta = np.ones((SCENE.height, SCENE.width), np.float32)
+            beta[:, region] = SCENE.sweep_beta(sweep, frame)[:, region]
+            image = to_half(SCENE.noisy(SCENE.image(beta), frame))
+            header = Header(SCENE.width, SCENE.height)
+            write_exr(folder / f"take.{1001 + frame}.exr", {"RGB": image}, header)
+        scan(folder, tmp_path / name, plane=mask)
+        made.append(tmp_path / name)
+    with pytest.raises(ReshootError, match="reshoot: two sweeps reached only"):
+        warp(made, tmp_path / "warp")
+    assert not (tmp_path / "warp").exists()

@@ -4,8 +4,9 @@ An edge sharper than its own step falls between two frames; where, only those pi
 frame caught half-way. How long the edge takes to pass a pixel is told by how many were caught.
 """
 
+from collections import deque
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -35,6 +36,14 @@ _PROFILE, _LEAST_ERROR = 0.1, 0.01
 _SHARP, _SOFT = 0.6, 1.0
 # Standard deviation of a time of which only the interval between two frames is known.
 INTERVAL_ERROR = 1 / np.sqrt(12)
+# Of what was brighter than this part of the lit value nothing is kept while a pass is read; so the
+# crossing of pixels that lose less than twice as much in all may not be found.
+_NEARLY_LIT = np.float32(0.96)
+LEAST_CONTRAST = 2 * (1 - float(_NEARLY_LIT))
+# Half the widths of the windows in which times are taken for linear, pixels.
+_WINDOWS = (2, 5)
+# Rows that are converted at a time.
+_ROWS = 32
 # Less than this part of the usual contrast is that of a pixel in shade.
 _SHADE = 0.4
 
@@ -67,39 +76,13 @@ class ShadowTimes:
 
 
 def luminance(image: NDArray[np.floating]) -> Float32:
-    """(H, W, 3) linear RGB to (H, W) float32."""
-    red, green, blue = (image[..., c].astype(np.float32) for c in range(3))
-    return np.asarray(red * LUMA[0] + green * LUMA[1] + blue * LUMA[2], np.float32)
-
-
-class LuminanceRange:
-    """Running I_min and I_max of a pass, in constant memory. Non-finite values are passed over."""
-
-    def __init__(self) -> None:
-        self.lowest: Float32 | None = None
-        self.highest: Float32 | None = None
-        self.frames = 0
-
-    def add(self, gray: Float32) -> None:
-        """Take in one frame's luminance, (H, W) float32."""
-        finite = np.isfinite(gray)
-        if not finite.all():
-            gray = np.where(finite, gray, np.float32(np.nan))
-        if self.lowest is None or self.highest is None:
-            self.lowest, self.highest = gray.copy(), gray.copy()
-        else:
-            np.fmin(self.lowest, gray, out=self.lowest)
-            np.fmax(self.highest, gray, out=self.highest)
-        self.frames += 1
-
-
-def least_contrast(highest: Float32, frames: int, noise: NoiseModel) -> Float32:
-    """The contrast below which a pixel's minimum and maximum may be nothing but noise.
-
-    Returns:
-        (H, W) float32, linear light.
-    """
-    return np.asarray(_sigma(highest, noise) * np.maximum(extreme_range(frames), 8), np.float32)
+    """(H, W, 3) linear RGB to (H, W) float32; not finite where a channel isn't."""
+    gray = np.empty(image.shape[:2], np.float32)
+    # In bands that fit the cache: most of the work is the conversion to float.
+    for first in range(0, len(image), _ROWS):
+        band = slice(first, first + _ROWS)
+        gray[band] = cv2.transform(image[band].astype(np.float32), LUMA[np.newaxis])
+    return gray
 
 
 class Crossings(NamedTuple):
@@ -109,6 +92,7 @@ class Crossings(NamedTuple):
         at: (H, W) int32, position of the later frame among those looked at, ≥ 1; 0 unknown.
         before, after: (H, W) float32, luminance in the frame before and in that one.
         lowest, highest: (H, W) float32, I_min and I_max of the pass.
+        lost: (H, W) bool, unknown only because the frame that would tell was no longer kept.
         frames: how many were looked at.
     """
 
@@ -117,25 +101,27 @@ class Crossings(NamedTuple):
     after: Float32
     lowest: Float32
     highest: Float32
+    lost: Bool
     frames: int
 
 
 class CrossingFinder:
-    """Finds the first crossing of the half-way threshold, frame by frame, in constant memory.
+    """Finds each pixel's first crossing of the half-way threshold in one reading of the pass.
+
+    The threshold is known only at the end. But as long as nothing was darker than it is so far, the
+    crossing lies ahead, and a frame that is darker than it, is it. Only while an edge passes, and
+    the threshold sinks with it, the crossing moves on to a frame after the first: that one is
+    looked up among the last few, which are kept.
 
     What follows the leading edge makes no difference. A pixel that is below the threshold from the
-    start has no crossing that was seen: unknown.
+    start has no crossing that was seen: unknown. Of pixels that never lose `LEAST_CONTRAST` of
+    their light, crossings may be wrong.
     """
 
-    def __init__(self, lowest: Float32, highest: Float32, least: Float32) -> None:
-        """Args: I_min, I_max and the contrast below which nothing is known, each (H, W)."""
-        self._lowest, self._highest = lowest, highest
-        self._threshold = (highest + lowest) / 2
-        self._open = (highest - lowest) > least
-        self._at = np.zeros(lowest.shape, np.int32)
-        self._before = np.full(lowest.shape, np.nan, np.float32)
-        self._after = self._before.copy()
-        self._last: Float32 | None = None
+    def __init__(self, kept: int = 8) -> None:
+        """Args: how many frames are kept; an edge may take about twice as many to pass."""
+        self._kept = kept
+        self._recent: deque[Float32] = deque(maxlen=kept + 2)
         self._frames = 0
 
     def add(self, gray: Float32) -> None:
@@ -143,25 +129,135 @@ class CrossingFinder:
 
         Where it isn't finite the last value that was stands.
         """
+        gray = np.ascontiguousarray(gray, np.float32)
         finite = np.isfinite(gray)
         if not finite.all():
-            last = np.full_like(gray, np.nan) if self._last is None else self._last
+            last = self._recent[-1] if self._recent else np.full_like(gray, np.nan)
             gray = np.where(finite, gray, last)
-        with np.errstate(invalid="ignore"):
-            below = self._open & (gray < self._threshold)
-        if self._last is not None:
-            np.copyto(self._at, self._frames, where=below)
-            np.copyto(self._before, self._last, where=below)
-            np.copyto(self._after, gray, where=below)
-        self._open &= ~below
-        self._last = gray
+        if self._frames:
+            self._look(gray)
+        else:
+            self._shape = gray.shape
+            self._low, self._high = gray.ravel().copy(), gray.ravel().copy()
+            # The lowest a frame ago; and the lowest before the frame before the crossing.
+            self._lower, self._floor = (np.full(gray.size, np.nan, np.float32) for _ in range(2))
+            # As if all had crossed in the first frame, before which nothing is known.
+            self._after = self._low.copy()
+            self._before, self._earlier, self._next = (self._lower.copy() for _ in range(3))
+            self._moved = np.arange(gray.size)
+            self._at = np.zeros(gray.size, np.int32)
+            self._lost = np.zeros(gray.size, bool)
+        self._recent.append(gray)
         self._frames += 1
 
     def found(self) -> Crossings:
-        """What was found so far."""
-        at = np.where(np.isfinite(self._before), self._at, 0).astype(np.int32)
-        ends = (self._before, self._after)
-        return Crossings(at, *ends, self._lowest, self._highest, self._frames)
+        """What was found.
+
+        Raises:
+            ValueError: no frame was looked at.
+        """
+        if not self._frames:
+            raise ValueError("no frame was looked at")
+        threshold = (self._low + self._high) / 2
+        at, after, before = self._at.copy(), self._after.copy(), self._before.copy()
+        with np.errstate(invalid="ignore"):
+            # Light that grew after the crossing has raised the threshold: it lies earlier.
+            lost = self._lost | (self._floor < threshold)
+            late = (before < threshold) & ~lost
+        at[late] -= 1
+        after[late], before[late] = before[late], self._earlier[late]
+        at[lost | ~np.isfinite(before)] = 0
+
+        def plane(values: NDArray[Any]) -> NDArray[Any]:
+            return values.reshape(self._shape)
+
+        ends, extremes = (plane(before), plane(after)), (plane(self._low), plane(self._high))
+        return Crossings(plane(at), *ends, *extremes, plane(lost), self._frames)
+
+    def _look(self, gray: Float32) -> None:
+        """Only where a frame is the darkest so far can the crossing move."""
+        now = gray.ravel()
+        low, high = self._low, self._high
+        self._next[self._moved] = now[self._moved]
+        np.fmax(high, now, out=high)
+        darker = np.flatnonzero(now < low)
+        # What is nearly as bright as it ever was crosses no threshold that matters in the end.
+        darker = darker[now[darker] < _NEARLY_LIT * high[darker]]
+        threshold = (high[darker] + now[darker]) / np.float32(2)
+        fresh = low[darker] >= np.minimum(threshold, _NEARLY_LIT * high[darker])
+        stale = ~fresh & ~(self._after[darker] < threshold)
+        moved = [darker[fresh]]
+        self._take(moved[0], 0, now)
+        self._lost[moved[0]] = False
+        self._floor[moved[0]] = self._lower[moved[0]]
+        np.fmin(low, now, out=self._lower)
+        self._lower, self._low = low, self._lower
+        old, threshold = darker[stale], threshold[stale]
+        onward = self._next[old] < threshold
+        self._shift(old[onward])
+        moved.append(self._search(old[~onward], threshold[~onward], now))
+        self._moved = np.concatenate(moved)
+
+    def _take(self, pixels: NDArray[np.intp], ago: int, now: Float32) -> None:
+        """Put the crossing of these pixels into the frame so many ago."""
+
+        def values(ago: int) -> Float32:
+            if ago == 0:
+                return now[pixels]
+            if ago > len(self._recent):
+                return np.full(len(pixels), np.nan, np.float32)
+            return self._recent[-ago].ravel()[pixels]
+
+        self._at[pixels] = self._frames - ago
+        self._after[pixels], self._before[pixels] = values(ago), values(ago + 1)
+        self._earlier[pixels] = values(ago + 2)
+        self._next[pixels] = values(ago - 1) if ago else np.nan
+
+    def _shift(self, pixels: NDArray[np.intp]) -> None:
+        """Move the crossing of these pixels on by a frame."""
+        self._at[pixels] += 1
+        self._floor[pixels] = np.fmin(self._floor[pixels], self._before[pixels])
+        self._earlier[pixels], self._before[pixels] = self._before[pixels], self._after[pixels]
+        self._after[pixels], self._next[pixels] = self._next[pixels], np.nan
+
+    def _search(
+        self, pixels: NDArray[np.intp], threshold: Float32, now: Float32
+    ) -> NDArray[np.intp]:
+        """Move the crossing to the first frame below the threshold, among those still kept.
+
+        Returns:
+            The pixels whose crossing is in the frame under way.
+        """
+        kept = min(self._kept, len(self._recent))
+        old = self._at[pixels]
+        # What passed between the old crossing and the frames that are kept can't be told.
+        self._lost[pixels] |= self._frames - old > kept + 1
+        floor = np.fmin(self._floor[pixels], self._before[pixels])
+        above = self._after[pixels]
+        for ago in range(kept, -1, -1):
+            values = (now if ago == 0 else self._recent[-ago].ravel())[pixels]
+            later = self._frames - ago > old
+            below = later & (values < threshold)
+            self._take(pixels[below], ago, now)
+            self._floor[pixels[below]] = floor[below]
+            if ago == 0:
+                return pixels[below]
+            floor = np.where(later, np.fmin(floor, above), floor)
+            above = np.where(later, values, above)
+            pixels, threshold, old = pixels[~below], threshold[~below], old[~below]
+            floor, above = floor[~below], above[~below]
+        return pixels[:0]
+
+
+def significant(crossings: Crossings, noise: NoiseModel) -> Crossings:
+    """Crossings without those of pixels whose minimum and maximum may be nothing but noise."""
+    contrast = crossings.highest - crossings.lowest
+    least = _sigma(crossings.highest, noise) * max(float(extreme_range(crossings.frames)), 8.0)
+    with np.errstate(invalid="ignore"):
+        seen = contrast > np.maximum(least, LEAST_CONTRAST * crossings.highest)
+    return crossings._replace(
+        at=np.where(seen, crossings.at, 0).astype(np.int32), lost=crossings.lost & seen
+    )
 
 
 def interpolated_times(crossings: Crossings) -> Float32:
@@ -239,7 +335,7 @@ def refined_times(time: Float32, error: Float32, at: NDArray[np.int32]) -> tuple
     Returns:
         Positions among the frames and their predicted errors; (H, W) float32 each.
     """
-    fitted, spread = fit_planes(time, error)
+    fitted, spread = fit_planes(time, error, _WINDOWS)
     return np.clip(fitted, at - 1, at).astype(np.float32), spread
 
 
@@ -279,8 +375,10 @@ def _least_caught(part: Float32) -> float:
 
 def _sigma(gray: Float32, noise: NoiseModel) -> Float32:
     """Standard deviation of the luminance ``gray``, (H, W)."""
-    colours = np.repeat(np.nan_to_num(gray)[..., None], 3, axis=-1)
-    return np.asarray(np.sqrt(((noise.sigma(colours) * LUMA) ** 2).sum(axis=-1)), np.float32)
+    weights = LUMA.astype(np.float64) ** 2
+    slope, floor = float(weights @ noise.slope), float(weights @ noise.floor)
+    variance = np.maximum(np.nan_to_num(gray), 0) * np.float32(slope) + np.float32(floor)
+    return np.asarray(np.sqrt(variance), np.float32)
 
 
 def _largest(count: float) -> float:

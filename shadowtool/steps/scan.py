@@ -7,19 +7,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.noise import NoiseModel
+from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.pictures import time_picture
 from shadowtool.core.plane_fits import reach
 from shadowtool.core.shadow_lines import NoLinesError, ShadowLines, fit_shadow_lines, line_speed
 from shadowtool.core.shadow_time import (
     CrossingFinder,
     Crossings,
-    LuminanceRange,
     ShadowTimes,
-    least_contrast,
     luminance,
     own_times,
     refined_times,
+    significant,
     without_shade,
 )
 from shadowtool.core.warp_map import Pass
@@ -84,8 +83,7 @@ def scan(
         figures = unchanged(output, products, mark)
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
-    noise = footage.measure_noise(run.jobs)
-    crossings, marks, used = _crossings(footage, frames, noise, run)
+    crossings, noise, marks, used = _crossings(footage, frames, run)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
     numbers = np.array([float(frame) for frame in used])
     if numbers[-1] > 2**20:
@@ -113,42 +111,38 @@ def scan(
 
 
 def _crossings(
-    footage: Footage, frames: list[Frame], noise: NoiseModel, run: Run
-) -> tuple[Crossings, list[str], list[Frame]]:
-    """Two readings of the pass: its range, then its crossings."""
+    footage: Footage, frames: list[Frame], run: Run
+) -> tuple[Crossings, NoiseModel, list[str], list[Frame]]:
+    """One reading of the pass."""
+    samples = sample_positions(len(frames))
 
-    def read(frame: Frame) -> tuple[Float32, str] | None:
+    def read(position: int) -> tuple[Float32, Float32 | None, str] | None:
         try:
-            image = footage.image(frame)
+            image = footage.image(frames[position])
         except DamagedFileError:
             if run.missing == "skip":
                 return None
             raise
-        return luminance(image.rgb(footage.transfer)), image.fingerprint
+        values = image.rgb(footage.transfer)
+        sample = thin(values) if position in samples.values() else None
+        return luminance(values), sample, image.fingerprint
 
-    total = 2 * len(frames)
-    run.progress(0, total)
-    span, marks, used = LuminanceRange(), [], []
-    for number, (frame, item) in enumerate(
-        zip(frames, ordered_map(read, frames, run.jobs), strict=True), start=1
-    ):
-        run.progress(number, total)
+    finder, marks, used = CrossingFinder(), list[str](), list[Frame]()
+    thinned: dict[int, Float32] = {}
+    run.progress(0, len(frames))
+    for position, item in enumerate(ordered_map(read, range(len(frames)), run.jobs)):
         if item is not None:
-            span.add(item[0])
-            marks.append(item[1])
-            used.append(frame)
-    if span.lowest is None or span.highest is None or len(used) < 3:
+            gray, sample, mark = item
+            finder.add(gray)
+            marks.append(mark)
+            used.append(frames[position])
+            if sample is not None:
+                thinned |= {n: sample for n, where in samples.items() if where == position}
+        run.progress(position + 1, len(frames))
+    if len(used) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
-    least = least_contrast(span.highest, span.frames, noise)
-    finder = CrossingFinder(span.lowest, span.highest, least)
-    for number, (_, item) in enumerate(
-        zip(used, ordered_map(read, used, run.jobs), strict=True), start=len(frames) + 1
-    ):
-        if item is not None:
-            finder.add(item[0])
-        run.progress(number, total)
-    run.progress(total, total)
-    return finder.found(), marks, used
+    noise = noise_model(noise_levels(thinned))
+    return significant(finder.found(), noise), noise, marks, used
 
 
 def _times(

@@ -18,7 +18,6 @@ from shadowtool.core.diffusion import diffuse
 from shadowtool.core.shadow_lines import fit_shadow_lines, line_speed
 from shadowtool.core.shadow_time import (
     CrossingFinder,
-    LuminanceRange,
     ShadowTimes,
     interpolated_times,
     luminance,
@@ -58,19 +57,15 @@ def paper_map(scene: str) -> WarpMap:
     for take in SWEEPS:
         folder = noisy_take(scene, take)
         numbers = frame_numbers(scene, take)
-        frames = [luminance(load(folder / f"{take}.{number:04d}.exr")) for number in numbers]
-        span = LuminanceRange()
-        for gray in frames:
-            span.add(gray)
-        assert span.lowest is not None and span.highest is not None
-        contrast = span.highest - span.lowest
-        # The paper leaves out pixels of low contrast: here, a tenth of the usual.
-        least = np.full_like(contrast, 0.1 * np.median(contrast))
-        finder = CrossingFinder(span.lowest, span.highest, least)
-        for gray in frames:
-            finder.add(gray)
-        time = interpolated_times(finder.found())
-        lines = fit_shadow_lines(time, region, np.arange(len(frames), dtype=np.float64))
+        finder = CrossingFinder()
+        for number in numbers:
+            finder.add(luminance(load(folder / f"{take}.{number:04d}.exr")))
+        crossings = finder.found()
+        contrast = crossings.highest - crossings.lowest
+        # The paper leaves out pixels of low contrast: here, below a tenth of the usual.
+        low = contrast < 0.1 * np.median(contrast)
+        time = np.where(low, np.float32(np.nan), interpolated_times(crossings))
+        lines = fit_shadow_lines(time, region, np.arange(len(numbers), dtype=np.float64))
         passes.append(Pass(ShadowTimes.alone(time, contrast), lines))
     speeds = [line_speed(one.lines, region.shape) for one in passes]
     return diffuse(intersect(passes, speeds), 40)

@@ -40,12 +40,14 @@ INTERVAL_ERROR = 1 / np.sqrt(12)
 # crossing of pixels that lose less than twice as much in all may not be found.
 _NEARLY_LIT = np.float32(0.96)
 LEAST_CONTRAST = 2 * (1 - float(_NEARLY_LIT))
+# How many frames are kept meanwhile.
+_KEPT_BYTES, _LEAST_KEPT, _MOST_KEPT = 2**28, 6, 24
 # Half the widths of the windows in which times are taken for linear, pixels.
 _WINDOWS = (2, 5)
 # Rows that are converted at a time.
 _ROWS = 32
 # Less than this part of the usual contrast is that of a pixel in shade.
-_SHADE = 0.4
+_SHADE = 0.3
 
 
 @dataclass(frozen=True)
@@ -118,10 +120,11 @@ class CrossingFinder:
     their light, crossings may be wrong.
     """
 
-    def __init__(self, kept: int = 8) -> None:
-        """Args: how many frames are kept; an edge may take about twice as many to pass."""
+    def __init__(self, kept: int | None = None) -> None:
+        """Args: how many frames are kept; an edge may take about twice as many to pass. None for
+        as many as are no burden to memory."""
         self._kept = kept
-        self._recent: deque[Float32] = deque(maxlen=kept + 2)
+        self._recent: deque[Float32] = deque()
         self._frames = 0
 
     def add(self, gray: Float32) -> None:
@@ -138,6 +141,9 @@ class CrossingFinder:
             self._look(gray)
         else:
             self._shape = gray.shape
+            if self._kept is None:
+                self._kept = min(max(_KEPT_BYTES // gray.nbytes, _LEAST_KEPT), _MOST_KEPT)
+            self._recent = deque(maxlen=self._kept + 2)
             self._low, self._high = gray.ravel().copy(), gray.ravel().copy()
             # The lowest a frame ago; and the lowest before the frame before the crossing.
             self._lower, self._floor = (np.full(gray.size, np.nan, np.float32) for _ in range(2))
@@ -228,7 +234,7 @@ class CrossingFinder:
         Returns:
             The pixels whose crossing is in the frame under way.
         """
-        kept = min(self._kept, len(self._recent))
+        kept = min(self._kept or 0, len(self._recent))
         old = self._at[pixels]
         # What passed between the old crossing and the frames that are kept can't be told.
         self._lost[pixels] |= self._frames - old > kept + 1

@@ -6,7 +6,7 @@ interpolated; the paper's x = m·y + b fails for lines near horizontal.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ _POOR_RATIO, _POOR_FLOOR = 2.5, 0.5
 # A direction jumps if it is this many times the pass's median deviation off its neighbours'
 # course, and by more than the floor, radians.
 _JUMP_RATIO, _JUMP_FLOOR = 5.0, np.radians(0.75)
+# Bends are looked for in about so many lines, and told from so many.
+_BENT_LINES, _LEAST_BENT = 24, 5
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,63 @@ def line_speed(lines: ShadowLines, shape: tuple[int, ...]) -> Float64:
     speed[0], speed[-1] = step[0], step[-1]
     speed[1:-1] = (step[:-1] + step[1:]) / 2
     return speed
+
+
+class Bend(NamedTuple):
+    """How lines bow, as a lens with radial distortion bows them.
+
+    Attributes:
+        pixels: of a line as long as the picture is wide and half its height from the middle, how
+            far its middle is off its ends' chord; above 0 if lines bow towards the picture's middle
+            there (barrel distortion), below 0 if away from it.
+        certainty: ``pixels`` in standard deviations, from how well the lines agree.
+    """
+
+    pixels: float
+    certainty: float
+
+
+def line_bend(
+    time: NDArray[np.float32], plane: NDArray[np.bool_], frames: Float64, lines: ShadowLines
+) -> Bend:
+    """Whether the lines' residuals bend systematically.
+
+    A lens that moves a point at c + x to c + x(1 + k|x|²) moves the points of a line at the
+    distance ρ from the middle c by kρ(ρ² + u²) along its normal, u counted along the line. What of
+    that no straight line takes up is left in the residuals, and it has the same k in all lines.
+
+    Args:
+        time, plane, frames: as for `fit_shadow_lines`.
+        lines: what that made of them.
+    """
+    height, width = time.shape
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    some = np.searchsorted(frames, lines.frame)[:: max(1, len(lines) // _BENT_LINES)]
+    groups = zero_crossings(time, plane, frames[some])
+    at = {float(frame): i for i, frame in enumerate(lines.frame)}
+    found, weights = [], []
+    for index, points in groups.items():
+        line = at[float(frames[some[index]])]
+        normal, offset = lines.normal[line], lines.offset[line]
+        residual = points @ normal + offset
+        near = np.abs(residual) < _NEAR
+        if near.sum() < _LEAST_POINTS:
+            continue
+        along = (points[near] - middle) @ np.array([-normal[1], normal[0]]) / width
+        straight = np.stack([np.ones_like(along), along], axis=-1)
+        both = np.stack([along**2, residual[near]], axis=-1)
+        bow, rest = (both - straight @ np.linalg.lstsq(straight, both, rcond=None)[0]).T
+        expected = -(normal @ middle + offset) / width * bow
+        strength = float(expected @ expected)
+        if strength > 0:
+            found.append(float(expected @ rest) / strength)
+            weights.append(strength)
+    if len(found) < _LEAST_BENT:
+        return Bend(0.0, 0.0)
+    each, weight = np.asarray(found), np.asarray(weights)
+    mean = float(weight @ each / weight.sum())
+    spread = float(np.sqrt(weight**2 @ (each - mean) ** 2) / weight.sum())
+    return Bend(-mean * height / (2 * width) / 4, abs(mean) / max(spread, 1e-9))
 
 
 def zero_crossings(

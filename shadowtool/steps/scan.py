@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.pictures import time_picture
 from shadowtool.core.plane_fits import reach
-from shadowtool.core.shadow_lines import NoLinesError, ShadowLines, fit_shadow_lines, line_speed
+from shadowtool.core.shadow_lines import (
+    Bend,
+    NoLinesError,
+    ShadowLines,
+    fit_shadow_lines,
+    line_bend,
+    line_speed,
+)
 from shadowtool.core.shadow_time import (
     CrossingFinder,
     Crossings,
@@ -44,6 +51,11 @@ logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 PICTURE = "scan.png"
+
+# Bends of more pixels than this, that are so many standard deviations, come from a lens.
+_BENT, _CERTAIN = 1.0, 6.0
+# A sweep reaches little of the frame, and is fast: a part of the frame, pixels a frame.
+_LITTLE, _FAST = 0.5, 20.0
 
 
 def scan(
@@ -99,7 +111,9 @@ def scan(
             f"{footage.sequence.pattern}: reshoot: {error}; sweep the shadow across the plane,"
             " or mark a larger plane"
         ) from None
-    figures = _figures(times, lines, used)
+    bend = line_bend(times.time, region, numbers, lines)
+    figures = _figures(times, lines, used, bend)
+    _advise(figures, footage.sequence.pattern)
     mark = recipe.fingerprint([plane_mark, *marks])
     provenance = recipe.provenance(mark)
     make_folder(output)
@@ -183,7 +197,32 @@ def _numbers(clock: Float32, numbers: NDArray[np.float64]) -> Float32:
     return np.interp(clock, np.arange(len(numbers)), numbers).astype(np.float32)
 
 
-def _figures(times: ShadowTimes, lines: ShadowLines, frames: list[Frame]) -> Figures:
+def _advise(figures: Figures, take: str) -> None:
+    """Say what a crew should know before it leaves."""
+    bend, reached = figures["bend"], figures["reached"]
+    if abs(bend["pixels"]) > _BENT and bend["certainty"] > _CERTAIN:
+        logger.warning(
+            "%s: the shadow's lines bend by %.1f pixels, as a lens bends them; take the lens's"
+            " distortion out of all footage first",
+            take,
+            abs(bend["pixels"]),
+        )
+    if reached < _LITTLE:
+        logger.warning(
+            "%s: the sweep reached only %.0f%% of the frame; what it misses needs two others",
+            take,
+            100 * reached,
+        )
+    if figures["pixels_per_frame"] > _FAST:
+        logger.warning(
+            "%s: the shadow moves %.0f pixels a frame; small things fall between two frames,"
+            " sweep more slowly",
+            take,
+            figures["pixels_per_frame"],
+        )
+
+
+def _figures(times: ShadowTimes, lines: ShadowLines, frames: list[Frame], bend: Bend) -> Figures:
     speed = line_speed(lines, times.time.shape)
     turned = math.degrees(float(lines.angle[-1] - lines.angle[0]))
     origins = list(lines.origin)
@@ -199,6 +238,12 @@ def _figures(times: ShadowTimes, lines: ShadowLines, frames: list[Frame]) -> Fig
             "median": round(float(np.median(lines.residual)), 4),
             "largest": round(float(lines.residual.max()), 4),
         },
+        "predicted_error": {
+            # Of a time, in frames, and as far as the edge moves meanwhile.
+            "frames": round(error := float(np.median(times.error[np.isfinite(times.error)])), 4),
+            "pixels": round(error * float(np.median(speed)), 3),
+        },
+        "bend": {"pixels": round(bend.pixels, 2), "certainty": round(min(bend.certainty, 1e6), 1)},
         "pixels_per_frame": round(float(np.median(speed)), 3),
         "direction_degrees": round(math.degrees(float(lines.angle[len(lines) // 2])) % 360, 2),
         "turned_degrees": round(turned, 2),

@@ -6,8 +6,10 @@ from shadowtool.core.shadow_lines import (
     ShadowLines,
     fit_shadow_lines,
     interpolate_lines,
+    line_bend,
     zero_crossings,
 )
+from shadowtool.core.warp_map import identity_map
 from tests.scene import Scene, Sweep
 
 SCENE = Scene()
@@ -149,6 +151,43 @@ def test_a_plane_that_no_edge_crosses_is_refused() -> None:
     tiny[10:12, 10:12] = True
     with pytest.raises(NoLinesError):
         fit_shadow_lines(edge_times(Sweep(0.3)), tiny, np.arange(60.0))
+
+
+def bowed(sweep: Sweep, strength: float) -> np.ndarray:
+    """Times of a sweep as a lens sees them that takes a point at x from the middle to
+    x(1 + strength |x|²), x in units of half the width."""
+    half = SCENE.width / 2
+    middle = np.array([(SCENE.width - 1) / 2, (SCENE.height - 1) / 2])
+    seen = identity_map(SCENE.height, SCENE.width) - middle
+    # The undistorted place of each pixel, to first order.
+    place = seen * (1 - strength * ((seen / half) ** 2).sum(axis=-1, keepdims=True)) + middle
+    normal, offset = SCENE.edge(sweep, 0)
+    return ((place @ normal + offset) / sweep.speed).astype(np.float32)
+
+
+@pytest.mark.parametrize("angle", [0.2, 1.4, 2.6])
+@pytest.mark.parametrize("strength", [-0.03, 0.02])
+def test_a_lens_that_bows_lines_is_found(angle: float, strength: float) -> None:
+    sweep = Sweep(angle)
+    frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
+    everywhere = np.ones_like(SCENE.plane)
+    time = bowed(sweep, strength)
+    lines = fit_shadow_lines(time, everywhere, frames)
+    bend = line_bend(time, everywhere, frames, lines)
+    # At half the height from the middle and half the width along: strength · ρ · u².
+    assert bend.pixels == pytest.approx(-strength * SCENE.height / 2, rel=0.25)
+    assert bend.certainty > 10
+
+
+def test_straight_lines_do_not_bend() -> None:
+    for angle in (0.2, 1.4, 2.6):
+        sweep = Sweep(angle)
+        frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
+        rng = np.random.default_rng(0)
+        time = edge_times(sweep) + rng.normal(scale=0.05, size=SCENE.plane.shape)
+        lines = fit_shadow_lines(time.astype(np.float32), SCENE.plane, frames)
+        bend = line_bend(time.astype(np.float32), SCENE.plane, frames, lines)
+        assert abs(bend.pixels) < 0.1
 
 
 def test_inputs_are_left_alone() -> None:

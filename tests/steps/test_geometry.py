@@ -126,3 +126,26 @@ def test_sweeps_that_hardly_meet_are_to_be_shot_again(tmp_path: Path, mask: str)
     with pytest.raises(ReshootError, match="reshoot: two sweeps reached only"):
         warp(made, tmp_path / "warp")
     assert not (tmp_path / "warp").exists()
+
+
+def test_a_lens_that_bows_the_lines_is_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    sweep = SWEEPS["second"]
+    seen = IDENTITY - np.float32([SCENE.width / 2, SCENE.height / 2])
+    # Pincushion distortion, 5% at half the width.
+    radius = ((seen / (SCENE.width / 2)) ** 2).sum(axis=-1, keepdims=True)
+    normal, offset = SCENE.edge(sweep, 0)
+    place = seen * (1 - 0.05 * radius) + np.float32([SCENE.width / 2, SCENE.height / 2])
+    distance = place @ normal + offset
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for frame in range(SCENE.frames_of(sweep)):
+        beta = np.clip(distance - sweep.speed * frame + 0.5, 0, 1)
+        image = to_half(SCENE.noisy(SCENE.image(beta), frame))
+        path = folder / f"take.{1001 + frame}.exr"
+        write_exr(path, {"RGB": image}, Header(SCENE.width, SCENE.height))
+    everything = f"0,0 {SCENE.width},0 {SCENE.width},{SCENE.height} 0,{SCENE.height}"
+    result = scan(folder, tmp_path / "scan", plane=everything)
+    assert result.figures["bend"]["pixels"] == pytest.approx(-0.05 * SCENE.height / 2, rel=0.3)
+    assert "as a lens bends them" in caplog.text

@@ -21,6 +21,7 @@ bench: .venv/installed-bench
 	$(BIN)/python -m tests.benchmarks.footage
 	$(BIN)/python -m tests.benchmarks.plates
 	$(BIN)/python -m tests.benchmarks.warp
+	$(BIN)/python -m tests.benchmarks.composite
 
 format: .venv/installed-dev
 	$(BIN)/ruff check --fix .

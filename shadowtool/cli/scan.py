@@ -21,8 +21,9 @@ from shadowtool.cli.options import step_command, transfer_option
 def command(source: str, output: Path, **options: Any) -> list[Any]:
     """Follow the shadow of a straight stick that is swept over the target scene once.
 
-    Writes scan.exr (time: the frame in which the shadow's leading edge reaches the pixel;
-    contrast), lines.json (the edge on the reference plane, frame by frame) and scan.png.
+    Writes scan.exr (time: the frame in which the shadow's leading edge reaches the pixel; error:
+    how far off that may be, in frames; contrast; own_time and own_error: what the pixel tells
+    alone), lines.json (the edge on the reference plane, frame by frame) and scan.png.
     """
     from shadowtool.steps.scan import scan
 

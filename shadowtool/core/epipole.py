@@ -19,9 +19,9 @@ Float64 = NDArray[np.float64]
 _SHORTEST, _SIGNIFICANT = 3.0, 4.0
 _LEAST_PIXELS = 60
 _HYPOTHESES, _SOME, _ROUNDS = 100, 500, 10
-# Displacements that miss the point by more than this, pixels, in the median, and by more than so
-# many predicted errors, have none in common.
-_MISS, _MISS_RATIO = 0.5, 2.0
+# Displacements have no point in common if in the median they miss it by more than this, pixels, by
+# more than so many predicted errors, and by more than this part of their length.
+_MISS, _MISS_RATIO, _MISS_PART = 0.5, 2.0, 0.02
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,8 @@ def find_epipole(warp: Float32, error: Float32, positions: Float32) -> Epipole |
         rows = lines * (np.sqrt(weight * robust) / reach)[:, None]
         point = np.linalg.eigh(rows.T @ rows)[1][:, 0]
     median = float(np.median(_miss(point, lines, one)[0])) * scale
-    if median > max(_MISS, _MISS_RATIO * float(np.median(spread))):
+    typical = float(np.median(length[usable]))
+    if median > max(_MISS, _MISS_RATIO * float(np.median(spread)), _MISS_PART * typical):
         return None
     return Epipole(point, middle, scale, median)
 

@@ -48,8 +48,10 @@ class NoiseModel:
         Returns:
             (..., 3) float32, above 0 wherever ``floor`` is.
         """
-        variance = np.maximum(image, 0) * self.slope + self.floor
-        return np.asarray(np.sqrt(variance), np.float32)
+        variance = np.maximum(image, 0, dtype=np.float32)
+        variance *= self.slope.astype(np.float32)
+        variance += self.floor.astype(np.float32)
+        return np.asarray(np.sqrt(variance, out=variance), np.float32)
 
 
 @dataclass(frozen=True)

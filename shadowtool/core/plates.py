@@ -5,9 +5,11 @@ Eq. (4) of Chuang et al. 2003: S = min_f C_f, L = max_f C_f, each pixel and chan
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.half_keys import from_keys, not_finite, to_keys
 
 Float32 = NDArray[np.float32]
@@ -79,9 +81,9 @@ class ExtremePlates:
             np.maximum(self._highest, keys, out=self._highest)
             self._frames += np.uint32(1)
         else:
-            where = seen[..., None]
-            np.minimum(self._lowest, keys, out=self._lowest, where=where)
-            np.maximum(self._highest, keys, out=self._highest, where=where)
+            mask = seen.view(np.uint8)
+            cv2.copyTo(np.minimum(self._lowest, keys), mask, self._lowest)
+            cv2.copyTo(np.maximum(self._highest, keys), mask, self._highest)
             self._frames += seen
 
     def plates(self) -> Plates:
@@ -94,8 +96,9 @@ class ExtremePlates:
             raise ValueError("no frame was added")
         unseen = self._frames == 0
         lit, shadow = _values(self._highest), _values(self._lowest)
-        lit[unseen] = np.nan
-        shadow[unseen] = np.nan
+        if unseen.any():
+            lit[unseen] = np.nan
+            shadow[unseen] = np.nan
         return Plates(lit, shadow, self._frames.copy())
 
 
@@ -108,7 +111,7 @@ def _order_keys(image: NDArray[np.floating]) -> NDArray[np.int16] | Float32:
 
 def _values(keys: NDArray[np.int16] | Float32) -> Float32:
     if keys.dtype == np.int16:
-        return from_keys(keys.astype(np.int16)).astype(np.float32)
+        return to_float(from_keys(keys.astype(np.int16, copy=False)))
     return keys.astype(np.float32)
 
 

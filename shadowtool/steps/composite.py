@@ -10,14 +10,15 @@ from shadowtool.choices import Fill, Format
 from shadowtool.core.beta import inpaint
 from shadowtool.core.compositing import over, shade, shadow_ratio
 from shadowtool.core.filling import fill_membrane
-from shadowtool.core.warp_map import WarpMap, resample
+from shadowtool.core.half_floats import to_float, to_half
+from shadowtool.core.warp_map import positions, sample
 from shadowtool.errors import InputError
 from shadowtool.io.image import (
     EXR,
     PNG,
+    Image,
     read_image,
     to_code,
-    to_half,
     write_exr,
     write_png,
 )
@@ -68,12 +69,13 @@ def composite(
     header = stored.header
     for sequence in (figure_frames, beta_frames):
         require_frames(sequence, frames, header, f"the plates in {plates}", run.missing)
-    warp_map: WarpMap | None = None
+    places: Float32 | None = None
     shared = [stored.fingerprint]
     if warp is not None:
         warp = warp / WARP if warp.is_dir() else warp
         warp_map, warp_header, mark = read_warp(warp)
         require_size(warp, warp_header, header, f"the plates in {plates}")
+        places = positions(warp_map.warp)
         shared.append(mark)
     suffix = EXR if file_format == "exr" else PNG
     name = output.resolve().name
@@ -104,15 +106,12 @@ def composite(
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
         visibility, unknown = _visibility(beta_frames, frame, fill)
         figure = read_image(figure_frames.path(frame))
-        colour, alpha = figure.rgba()
-        bad = ~(np.isfinite(colour).all(axis=-1) & np.isfinite(alpha))
-        alpha = np.clip(np.where(bad, np.float32(0), alpha), 0, 1)
-        colour = np.where(bad[..., None], np.float32(0), colour)
-        if warp_map is not None:
-            visibility = resample(visibility, warp_map.warp, outside=1.0)
+        colour, alpha, bad = _figure(figure)
+        if places is not None:
+            visibility = sample(visibility, places, outside=1.0)
         shaded = shade(lit, shadow, visibility)
         result = over(colour, alpha, shaded)
-        figures = {"unknown": unknown, "not_finite": int(bad.sum())}
+        figures = {"unknown": unknown, "not_finite": bad}
         marked = with_figures(provenance, figures)
         target, *ratios = products(frame)
         frame_header = figure.header
@@ -147,8 +146,8 @@ def _part(mattes: Path | None, folder: str) -> Path:
 def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:
     """β of a frame, (H, W) or (H, W, 3), and how many of its pixels are unknown."""
     image = read_image(sequence.path(frame))
-    colour = image.layers.get("RGB")
-    values = image.plane("Y") if colour is None else image.rgb("none").astype(np.float32)
+    coloured = "RGB" in image.members
+    values = to_float(image.rgb("none")) if coloured else image.plane("Y")
     holes = ~np.isfinite(values)
     if holes.any():
         values = np.where(holes, np.float32(np.nan), values)
@@ -159,6 +158,19 @@ def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, 
         elif fill == "inpaint":
             values = np.dstack([inpaint(values[..., c]) for c in range(3)])
     return values, int(holes.any(axis=-1).sum() if holes.ndim == 3 else holes.sum())
+
+
+def _figure(image: Image) -> tuple[Float32, Float32, int]:
+    """Premultiplied colour (H, W, 3), alpha (H, W) in [0, 1], and in how many pixels there is NaN
+    or infinity, which becomes nothing."""
+    colour, alpha = image.rgba()
+    count = 0
+    if not (np.isfinite(colour).all() and np.isfinite(alpha).all()):
+        bad = ~(np.isfinite(colour).all(axis=-1) & np.isfinite(alpha))
+        count = int(bad.sum())
+        alpha[bad] = 0
+        colour[bad] = 0
+    return colour, np.clip(alpha, 0, 1), count
 
 
 def _complete(lit: Float32, shadow: Float32) -> tuple[Float32, Float32, int]:

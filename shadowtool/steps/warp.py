@@ -15,7 +15,8 @@ from shadowtool.core.warp_map import (
     identity_map,
     intersect,
     pass_angles,
-    resample,
+    positions,
+    sample,
 )
 from shadowtool.errors import OptionError, ReshootError
 from shadowtool.io.files import is_file, make_folder
@@ -163,17 +164,17 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     def products(frame: Frame) -> list[Path]:
         return [frames.place(frame)]
 
+    places = positions(warp_map.warp)
+
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
         image = read_image(sequence.path(frame))
-        scaled = _scaled(warp_map, header, image.header)
-        layers = {}
-        for name, values in image.layers.items():
+        scaled = _scaled(places, header, image.header)
+        channels = {}
+        for name, values in image.planes.items():
             edge = 0.0 if name == "confidence" else outside
-            plain = image.rgb("none") if values.dtype.kind == "u" and values.ndim == 3 else values
-            single = image.plane(name) if values.ndim == 2 else plain
-            warped = resample(single, scaled, edge)
-            layers[name] = warped if values.dtype == np.float32 else to_half(warped)
-        write_exr(products(frame)[0], layers, image.header, provenance)
+            warped = sample(image.channel(name), scaled, edge)
+            channels[name] = warped if values.dtype == np.float32 else to_half(warped)
+        write_exr(products(frame)[0], channels, image.header, provenance)
         return {}
 
     def sources(frame: Frame) -> list[Path]:
@@ -183,12 +184,12 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     return work.run(frames.present, run, frames.absent)
 
 
-def _scaled(warp_map: WarpMap, header: Header, source: Header) -> np.ndarray:
-    """W for a source picture of another size than the map's: an ST map knows no size."""
+def _scaled(places: np.ndarray, header: Header, source: Header) -> np.ndarray:
+    """Positions in a picture of another size than the map's: an ST map knows no size."""
     if source.size == header.size:
-        return warp_map.warp
+        return places
     factor = np.array(source.size, np.float32) / np.array(header.size, np.float32)
-    return ((warp_map.warp + 0.5) * factor - 0.5).astype(np.float32)
+    return ((places + 0.5) * factor - 0.5).astype(np.float32)
 
 
 def _figures(passes: list[Pass], measured: WarpMap, scans: list[Path]) -> Figures:

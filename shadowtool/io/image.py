@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -73,42 +73,15 @@ class Image:
     Attributes:
         path: where it came from.
         header: see `Header`.
-        planes: channels by their full names, each (H, W), of the display window's size; float16 or
-            float32, PNG's 8 and 16 bit as uint8 and uint16.
+        layers: arrays by name, (H, W) or (H, W, C), of the display window's size; float16 or
+            float32, PNG's 8 and 16 bit as uint8 and uint16. Colour stands under "RGB" or "RGBA".
         fingerprint: of the file's content.
     """
 
     path: Path
     header: Header
-    planes: Mapping[str, NDArray[Any]]
+    layers: Mapping[str, NDArray[Any]]
     fingerprint: str
-
-    @cached_property
-    def members(self) -> Mapping[str, tuple[str, ...]]:
-        """The names of each layer's channels. R, G, B with or without A are one layer, "RGB" or
-        "RGBA", or by the name before their last point; any other channel is a layer of its own."""
-        left = dict.fromkeys(self.planes)
-        members: dict[str, tuple[str, ...]] = {}
-        for name in self.planes:
-            prefix, _, last = name.rpartition(".")
-            start = f"{prefix}." if prefix else ""
-            colour = tuple(f"{start}{c}" for c in "RGB")
-            if last != "R" or not all(c in self.planes for c in colour):
-                continue
-            if f"{start}A" in self.planes:
-                colour = (*colour, f"{start}A")
-            members[prefix or "RGBA"[: len(colour)]] = colour
-            for taken in colour:
-                del left[taken]
-        return members | {name: (name,) for name in left}
-
-    @cached_property
-    def layers(self) -> Mapping[str, NDArray[Any]]:
-        """Arrays by name, (H, W) or (H, W, C), as they are grouped by `members`."""
-        return {
-            name: self.planes[names[0]] if len(names) == 1 else self._merged(names)
-            for name, names in self.members.items()
-        }
 
     def rgb(self, transfer: str = "auto") -> NDArray[np.floating]:
         """(H, W, 3) linear light; float16 where the file has halfs and needs no decoding.
@@ -119,9 +92,9 @@ class Image:
         Raises:
             InputError: there is no colour that could be meant.
         """
-        names = self.members[self._colour_layer()]
-        values = self._merged(names[:3] if len(names) > 1 else names * 3)
-        return decode(values, resolve_transfer(transfer, self.path))
+        name = self._colour_layer()
+        values = self.layers[name]
+        return decode(_three_channels(values), resolve_transfer(transfer, self.path))
 
     def rgba(self, transfer: str = "auto") -> tuple[Float32, Float32]:
         """Premultiplied colour (H, W, 3) and alpha (H, W), linear light.
@@ -131,10 +104,11 @@ class Image:
         Raises:
             InputError: the file has no alpha.
         """
-        names = self.members[self._colour_layer()]
-        if len(names) < 4:
+        name = self._colour_layer()
+        values = self.layers[name]
+        if values.ndim == 2 or values.shape[-1] < 4:
             raise InputError(f"{self.path}: has no alpha channel; give frames with R, G, B and A")
-        alpha = _unit(self.planes[names[3]])
+        alpha = _unit(_one_channel(values, 3))
         colour = to_float(self.rgb(transfer))
         if self.path.suffix.lower() == PNG:
             colour = colour * alpha[..., None]
@@ -156,12 +130,13 @@ class Image:
                 # Paint programs add an opaque alpha, which says nothing of what was painted.
                 if name != "A" or len(names) == 1 or np.ptp(values) > 0 or values.shape == (1, 1):
                     return values
-        if len(self.planes) == 1:
-            return _unit(next(iter(self.planes.values())))
-        if list(self.members) == ["RGB"]:
-            return _unit(self.planes["G"])
+        only = list(self.layers.values())
+        if len(only) == 1 and only[0].ndim == 2:
+            return _unit(only[0])
+        if len(only) == 1 and next(iter(self.layers)) == "RGB":
+            return _unit(_one_channel(only[0], 1))
         raise InputError(
-            f"{self.path}: has no channel {' or '.join(names)}, only {', '.join(self.members)}"
+            f"{self.path}: has no channel {' or '.join(names)}, only {', '.join(self.layers)}"
         )
 
     def channel(self, name: str) -> Float32:
@@ -170,30 +145,23 @@ class Image:
         Raises:
             InputError: the file has no channel of that name.
         """
-        if name in self.planes:
-            return _unit(self.planes[name])
-        raise InputError(f"{self.path}: has no channel {name}, only {', '.join(self.members)}")
-
-    def _merged(self, names: tuple[str, ...]) -> NDArray[Any]:
-        """Channels side by side, (H, W, C); float32 if they are of several types."""
-        planes = [self.planes[name] for name in names]
-        types = {plane.dtype for plane in planes}
-        if len(types) > 1:
-            planes = [plane.astype(np.float32) for plane in planes]
-        elif types == {np.dtype(np.float16)}:
-            return cv2.merge([plane.view(np.uint16) for plane in planes]).view(np.float16)
-        return np.asarray(cv2.merge(planes))
+        for layer, values in self.layers.items():
+            if layer == name and values.ndim == 2:
+                return _unit(values)
+            if layer in ("RGB", "RGBA") and len(name) == 1 and name in layer:
+                return _unit(_one_channel(values, layer.index(name)))
+        raise InputError(f"{self.path}: has no channel {name}, only {', '.join(self.layers)}")
 
     def _colour_layer(self) -> str:
         for name in ("RGB", "RGBA"):
-            if name in self.members:
+            if name in self.layers:
                 return name
-        if len(self.members) == 1 or "Y" in self.members:
-            return "Y" if "Y" in self.members else next(iter(self.members))
-        colours = [name for name, members in self.members.items() if len(members) > 1]
+        if len(self.layers) == 1 or "Y" in self.layers:
+            return "Y" if "Y" in self.layers else next(iter(self.layers))
+        colours = [n for n, v in self.layers.items() if v.ndim == 3]
         if len(colours) != 1:
             raise InputError(
-                f"{self.path}: has no R, G, B, only {', '.join(self.members)};"
+                f"{self.path}: has no R, G, B, only {', '.join(self.layers)};"
                 " write the wanted layer as R, G, B first"
             )
         logger.warning("%s: no R, G, B; the layer %s is taken", self.path, colours[0])
@@ -220,6 +188,25 @@ def decode(values: NDArray[Any], transfer: str) -> NDArray[np.floating]:
 def _table(transfer: str, dtype: str) -> Float32:
     top = np.iinfo(dtype).max
     return TRANSFERS[transfer].decode(np.arange(top + 1, dtype=np.float32) / top)
+
+
+def _three_channels(values: NDArray[Any]) -> NDArray[Any]:
+    """(H, W), (H, W, 3) or (H, W, 4) as (H, W, 3) without the alpha; grey in each channel."""
+    bits = _for_opencv(values)
+    if values.ndim == 2:
+        return cv2.merge([bits, bits, bits]).view(values.dtype)
+    return values if values.shape[2] == 3 else cv2.merge(cv2.split(bits)[:3]).view(values.dtype)
+
+
+def _one_channel(values: NDArray[Any], index: int) -> NDArray[Any]:
+    """(H, W) of (H, W, C)."""
+    return cv2.extractChannel(_for_opencv(values), index).view(values.dtype)
+
+
+def _for_opencv(values: NDArray[Any]) -> NDArray[Any]:
+    # What only moves channels about takes halfs fastest as integers of their size.
+    kind = {np.dtype(np.float16): np.uint16, np.dtype(np.uint32): np.float32}
+    return values.view(kind.get(values.dtype, values.dtype))
 
 
 def _unit(values: NDArray[Any]) -> Float32:
@@ -336,9 +323,11 @@ def to_code(linear: NDArray[np.floating], transfer: str = "srgb") -> NDArray[np.
     return np.rint(np.clip(np.nan_to_num(coded), 0, 1) * 65535).astype(np.uint16)
 
 
-def _open_exr(path: Path, source: BinaryIO, header_only: bool = False) -> Any:
+def _open_exr(
+    path: Path, source: BinaryIO, header_only: bool = False, separate: bool = False
+) -> Any:
     try:
-        return OpenEXR.File(source, separate_channels=True, header_only=header_only)
+        return OpenEXR.File(source, separate_channels=separate, header_only=header_only)
     except _EXR_FAULTS as error:
         raise DamagedFileError(
             f"{path}: no EXR, or its header is damaged; write the frame again"
@@ -394,22 +383,30 @@ def _decode_exr(path: Path, content: Content) -> Image:
     # multi-part file vanishes without a word when the pixels are read.
     listed = _open_exr(path, io.BytesIO(content.data), header_only=True)
     header = _exr_header(path, listed)
-    file = _open_exr(path, io.BytesIO(content.data))
+    try:
+        file = _open_exr(path, io.BytesIO(content.data))
+    except DamagedFileError:
+        # OpenEXR joins R, G, B to one array only where they are of one type.
+        file = _open_exr(path, io.BytesIO(content.data), separate=True)
     if len(file.parts) != len(listed.parts):
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
     if len(file.parts) > 1:
         logger.warning("%s: of %d parts the first is taken", path, len(file.parts))
     raw = file.header(0)
     first, last = _window(path, raw, "dataWindow")
-    planes = {}
+    layers = {}
     for name, channel in file.channels(0).items():
         values = channel.pixels
         if values is None or values.shape[:2] != (last[1] - first[1] + 1, last[0] - first[0] + 1):
             raise InputError(f"{path}: channel {name} is subsampled; write it at full size")
-        planes[name] = _placed(values, first, header)
-    if not planes:
+        layers[name] = _placed(values, first, header)
+    if not layers:
         raise InputError(f"{path}: has no channels")
-    return Image(path, header, planes, content.fingerprint)
+    if {"R", "G", "B"} <= layers.keys():
+        names = [name for name in "RGBA" if name in layers]
+        colour = np.stack([layers.pop(name).astype(np.float32) for name in names], axis=-1)
+        layers["".join(names)] = colour
+    return Image(path, header, layers, content.fingerprint)
 
 
 def _placed(values: NDArray[Any], first: tuple[int, int], header: Header) -> NDArray[Any]:
@@ -418,7 +415,7 @@ def _placed(values: NDArray[Any], first: tuple[int, int], header: Header) -> NDA
     height, width = values.shape[:2]
     if (x, y) == (0, 0) and (width, height) == header.size:
         return values
-    canvas = np.zeros((header.height, header.width), values.dtype)
+    canvas = np.zeros((header.height, header.width, *values.shape[2:]), values.dtype)
     target = (
         slice(max(y, 0), max(min(y + height, header.height), 0)),
         slice(max(x, 0), max(min(x + width, header.width), 0)),
@@ -489,6 +486,10 @@ def _decode_png(path: Path, content: Content) -> Image:
         raise DamagedFileError(f"{path}: the PNG can't be decoded: {error.err}") from None
     if values is None or not whole:
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
-    names = "Y" if values.ndim == 2 else "BGRA"
-    planes = dict(zip(names, cv2.split(values), strict=False))
-    return Image(path, header, planes, content.fingerprint)
+    if values.ndim == 2:
+        layers = {"Y": values}
+    elif values.shape[2] == 4:
+        layers = {"RGBA": cv2.cvtColor(values, cv2.COLOR_BGRA2RGBA)}
+    else:
+        layers = {"RGB": cv2.cvtColor(values, cv2.COLOR_BGR2RGB)}
+    return Image(path, header, layers, content.fingerprint)

@@ -146,7 +146,7 @@ def _part(mattes: Path | None, folder: str) -> Path:
 def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:
     """β of a frame, (H, W) or (H, W, 3), and how many of its pixels are unknown."""
     image = read_image(sequence.path(frame))
-    coloured = "RGB" in image.members
+    coloured = "RGB" in image.layers
     values = to_float(image.rgb("none")) if coloured else image.plane("Y")
     holes = ~np.isfinite(values)
     if holes.any():

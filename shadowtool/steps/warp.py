@@ -169,12 +169,14 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
         image = read_image(sequence.path(frame))
         scaled = _scaled(places, header, image.header)
-        channels = {}
-        for name, values in image.planes.items():
+        layers = {}
+        for name, values in image.layers.items():
             edge = 0.0 if name == "confidence" else outside
-            warped = sample(image.channel(name), scaled, edge)
-            channels[name] = warped if values.dtype == np.float32 else to_half(warped)
-        write_exr(products(frame)[0], channels, image.header, provenance)
+            plain = image.rgb("none") if values.dtype.kind == "u" and values.ndim == 3 else values
+            single = image.plane(name) if values.ndim == 2 else plain
+            warped = sample(single, scaled, edge)
+            layers[name] = warped if values.dtype == np.float32 else to_half(warped)
+        write_exr(products(frame)[0], layers, image.header, provenance)
         return {}
 
     def sources(frame: Frame) -> list[Path]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Fill, Format
+from shadowtool.core.bands import bands
 from shadowtool.core.beta import inpaint
 from shadowtool.core.compositing import over, shade, shadow_ratio
 from shadowtool.core.filling import fill_membrane
@@ -16,6 +17,7 @@ from shadowtool.errors import InputError
 from shadowtool.io.image import (
     EXR,
     PNG,
+    Header,
     Image,
     read_image,
     to_code,
@@ -73,9 +75,7 @@ def composite(
     shared = [stored.fingerprint]
     if warp is not None:
         warp = warp / WARP if warp.is_dir() else warp
-        warp_map, warp_header, mark = read_warp(warp)
-        require_size(warp, warp_header, header, f"the plates in {plates}")
-        places = positions(warp_map.warp)
+        places, mark = _places(warp, header, f"the plates in {plates}")
         shared.append(mark)
     suffix = EXR if file_format == "exr" else PNG
     name = output.resolve().name
@@ -106,22 +106,28 @@ def composite(
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
         visibility, unknown = _visibility(beta_frames, frame, fill)
         figure = read_image(figure_frames.path(frame))
-        colour, alpha, bad = _figure(figure)
         if places is not None:
             visibility = sample(visibility, places, outside=1.0)
-        shaded = shade(lit, shadow, visibility)
-        result = over(colour, alpha, shaded)
+        result = np.empty(lit.shape, np.float16 if suffix == EXR else np.uint16)
+        ratios = np.empty(lit.shape, np.float16) if ratio else None
+        bad = 0
+        for rows in bands(lit.shape):
+            colour, alpha, own = _figure(figure.part(rows))
+            bad += own
+            shaded = shade(lit[rows], shadow[rows], visibility[rows])
+            coded = over(colour, alpha, shaded)
+            result[rows] = to_half(coded) if suffix == EXR else to_code(coded)
+            if ratios is not None:
+                ratios[rows] = to_half(shadow_ratio(shaded, lit[rows]))
         figures = {"unknown": unknown, "not_finite": bad}
         marked = with_figures(provenance, figures)
-        target, *ratios = products(frame)
-        frame_header = figure.header
+        target, *more = products(frame)
         if suffix == EXR:
-            write_exr(target, {"RGB": to_half(result)}, frame_header, marked)
+            write_exr(target, {"RGB": result}, figure.header, marked)
         else:
-            write_png(target, to_code(result), marked)
-        for path in ratios:
-            values = to_half(shadow_ratio(shaded, lit))
-            write_exr(path, {"RGB": values}, frame_header, marked)
+            write_png(target, result, marked)
+        if ratios is not None:
+            write_exr(more[0], {"RGB": ratios}, figure.header, marked)
         return figures
 
     def summary(rows: list[Figures]) -> Figures:
@@ -141,6 +147,13 @@ def _part(mattes: Path | None, folder: str) -> Path:
     if not part.is_dir():
         raise InputError(f"{mattes}: has no {folder}/; make it with `shadowtool matte`")
     return part
+
+
+def _places(warp: Path, header: Header, of: str) -> tuple[Float32, str]:
+    """Where an ST map takes β from, and its fingerprint."""
+    warp_map, warp_header, mark = read_warp(warp)
+    require_size(warp, warp_header, header, of)
+    return positions(warp_map.warp), mark
 
 
 def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:

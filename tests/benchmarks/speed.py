@@ -45,12 +45,19 @@ class Spent(NamedTuple):
 
 @dataclass(frozen=True)
 class Rival:
-    """Something to be timed: commands for a shell, one after the other."""
+    """Something to be timed.
+
+    Attributes:
+        output: a folder that it writes to, made anew.
+        absent: why it can't be timed.
+        peer: another program; it is slow, and timed in the first turn only.
+    """
 
     name: str
-    commands: Sequence[Sequence[str]]
-    output: Path | None = None
+    command: Sequence[str]
+    output: Path
     absent: str = ""
+    peer: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,13 +90,11 @@ def spent(command: Sequence[str]) -> Spent:
 
 
 def taken(rival: Rival) -> Spent:
-    """All of a rival's commands, into an empty folder."""
-    if rival.output is not None:
-        shutil.rmtree(rival.output, ignore_errors=True)
-    rows = [spent(command) for command in rival.commands]
-    return Spent(
-        sum(row.wall for row in rows), sum(row.cpu for row in rows), max(row.peak for row in rows)
-    )
+    """Run a rival, into an empty folder."""
+    shutil.rmtree(rival.output, ignore_errors=True)
+    if rival.peer:
+        rival.output.mkdir()
+    return spent(rival.command)
 
 
 # Footage.
@@ -198,7 +203,7 @@ class Stage:
     def ours(self, words: Sequence[str], name: str = "shadowtool") -> Rival:
         output = self.work / "ours"
         common = ("-o", str(output), "-q", f"-j{self.jobs}")
-        return Rival(name, [[*PROGRAM, *words, *common]], output)
+        return Rival(name, [*PROGRAM, *words, *common], output)
 
     def floor(self, name: str, parts: Sequence[str], models: Sequence[Path] = ()) -> Rival:
         """OpenEXR decoding these parts of each frame, and encoding the models for each."""
@@ -212,7 +217,7 @@ class Stage:
             "into": str(output),
         }
         script = str(Path(__file__).with_name("codec.py"))
-        return Rival(name, [[sys.executable, script, json.dumps(spec)]], output)
+        return Rival(name, [sys.executable, script, json.dumps(spec)], output)
 
     def oiiotool(self, words: Sequence[str], name: str = "oiiotool") -> Rival:
         """A command line for each frame of the take, in one process; ``words`` end in -o NAME."""
@@ -224,7 +229,7 @@ class Stage:
 
     def program(self, name: str, command: Sequence[str], output: Path) -> Rival:
         missing = "" if shutil.which(command[0]) else f"{command[0]} is not installed"
-        return Rival(name, [command], output, missing)
+        return Rival(name, command, output, missing, peer=True)
 
     def model(self, words: Sequence[str], product: str) -> Path:
         """A file such as the command writes, for the floor to encode."""
@@ -234,7 +239,6 @@ class Stage:
             rival = self.ours([*words, "--frames", str(middle)])
             taken(rival)
             kept.parent.mkdir(exist_ok=True)
-            assert rival.output is not None
             shutil.copy(rival.output / product.replace("#", str(middle)), kept)
         return kept
 
@@ -371,13 +375,9 @@ def show(row: Row, runs: int) -> None:
     """Time a row's rivals in turn, and print their medians beside what is asked."""
     present = [rival for rival in row.rivals if not rival.absent]
     times: dict[str, list[Spent]] = {rival.name: [] for rival in present}
-    for _ in range(runs):
+    for turn in range(runs):
         for rival in present:
-            if rival.output is not None and rival.output.name in ("oiiotool", "peer"):
-                shutil.rmtree(rival.output, ignore_errors=True)
-                rival.output.mkdir()
-                times[rival.name].append(taken(Rival(rival.name, rival.commands)))
-            else:
+            if turn == 0 or not rival.peer:
                 times[rival.name].append(taken(rival))
     print(f"\n{row.title}, {row.frames} frames")
     heads = ("", "wall s", "cpu s", "peak MB", "our wall", "our cpu", "asked")
@@ -392,10 +392,8 @@ def show(row: Row, runs: int) -> None:
         line = f"  {rival.name:24}{middle[0]:10.2f}{middle[1]:10.2f}{middle[2]:10.0f}"
         if rival is not present[0]:
             # Pair by pair: what else the machine does drifts from turn to turn.
-            ratios = [
-                statistics.median(a[i] / b[i] for a, b in zip(ours, own, strict=True))
-                for i in (0, 1)
-            ]
+            pairs = list(zip(ours, own, strict=False))
+            ratios = [statistics.median(a[i] / b[i] for a, b in pairs) for i in (0, 1)]
             line += f"{ratios[0]:9.2f}x{ratios[1]:9.2f}x"
             if (asked := row.asked.get(rival.name)) is not None:
                 verdict = "" if min(ratios) <= asked else " missed"

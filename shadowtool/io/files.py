@@ -84,6 +84,9 @@ def read_bytes(path: Path) -> bytes:
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
     """Put a file in place at once: a temporary beside it, then a rename.
 
+    It isn't forced to the disk, which takes longer than most frames do: after a power cut a file
+    may be empty, which resuming notices.
+
     Raises:
         RetryError: disk full, stale file handle and the like.
         ShadowtoolError: the folder is gone or may not be written.

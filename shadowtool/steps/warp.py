@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from shadowtool.core.bands import bands
 from shadowtool.core.diffusion import diffuse
+from shadowtool.core.half_floats import to_float, to_half
 from shadowtool.core.pictures import warp_picture
 from shadowtool.core.warp_map import (
     LEAST_ANGLE,
@@ -20,7 +22,7 @@ from shadowtool.core.warp_map import (
 )
 from shadowtool.errors import OptionError, ReshootError
 from shadowtool.io.files import is_file, make_folder
-from shadowtool.io.image import EXR, Header, read_header, read_image, to_half, write_exr, write_png
+from shadowtool.io.image import EXR, Header, read_header, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, WARP, read_scan, read_warp, write_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_size
@@ -174,8 +176,7 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
             edge = 0.0 if name == "confidence" else outside
             plain = image.rgb("none") if values.dtype.kind == "u" and values.ndim == 3 else values
             single = image.plane(name) if values.ndim == 2 else plain
-            warped = sample(single, scaled, edge)
-            layers[name] = warped if values.dtype == np.float32 else to_half(warped)
+            layers[name] = _warped(single, scaled, edge, values.dtype == np.float32)
         write_exr(products(frame)[0], layers, image.header, provenance)
         return {}
 
@@ -184,6 +185,17 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
 
     work = FrameWork(recipe, record_in, products, sources, [map_mark], make)
     return work.run(frames.present, run, frames.absent)
+
+
+def _warped(image: np.ndarray, places: np.ndarray, edge: float, single: bool) -> np.ndarray:
+    """The image at these places, as single or half floats."""
+    shape = (*places.shape[:2], *image.shape[2:])
+    result = np.empty(shape, np.float32 if single else np.float16)
+    image = to_float(image)
+    for rows in bands(shape):
+        values = sample(image, places[rows], edge)
+        result[rows] = values if single else to_half(values)
+    return result
 
 
 def _scaled(places: np.ndarray, header: Header, source: Header) -> np.ndarray:

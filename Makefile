@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 .DEFAULT_GOAL := sample
-.PHONY: sample test bench format readme clean
+.PHONY: sample test bench bench-speed soak format readme clean
 
 sample: .venv/installed
 	$(MAKE) -C sample_data PATH="$(abspath $(BIN)):$$PATH"
@@ -22,6 +22,14 @@ bench: .venv/installed-bench
 	$(BIN)/python -m tests.benchmarks.plates
 	$(BIN)/python -m tests.benchmarks.warp
 	$(BIN)/python -m tests.benchmarks.composite
+
+# How fast the commands are beside OpenEXR alone and beside oiiotool; half an hour on two cores.
+bench-speed: .venv/installed-dev
+	$(BIN)/python -m tests.benchmarks.speed
+
+# Two hundred kills and more, at random moments of every step.
+soak: .venv/installed-dev
+	$(BIN)/python -m tests.soak
 
 format: .venv/installed-dev
 	$(BIN)/ruff check --fix .

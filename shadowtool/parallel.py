@@ -49,22 +49,3 @@ def ordered_map(
             yield waiting.popleft().result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def bands(height: int, reach: int = 0, rows: int = 128) -> list[tuple[slice, slice]]:
-    """A picture's rows cut into bands that fit a processor's cache, for `ordered_map`.
-
-    The cut is the same whatever the number of threads.
-
-    Args:
-        reach: how far the result at a pixel depends on others, pixels.
-
-    Returns:
-        For each band the rows that are to be read, and where in these its own rows lie.
-    """
-    cut = []
-    for first in range(0, height, rows):
-        last = min(first + rows, height)
-        start, stop = max(first - reach, 0), min(last + reach, height)
-        cut.append((slice(start, stop), slice(first - start, last - start)))
-    return cut

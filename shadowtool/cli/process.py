@@ -32,13 +32,21 @@ class _Interrupted(BaseException):
 
 def run_process() -> NoReturn:
     """Run the command line of this process and end it with its exit code."""
-    signal.signal(signal.SIGTERM, _terminate)
-    # A shell starts background jobs with SIGINT ignored; that is to stay so.
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, _interrupt)
-    if "-v" not in sys.argv and "--verbose" not in sys.argv:
-        _silence_libraries()
-    code = run_command(sys.argv[1:])
+    try:
+        signal.signal(signal.SIGTERM, _terminate)
+        # A shell starts background jobs with SIGINT ignored; that is to stay so.
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            signal.signal(signal.SIGINT, _interrupt)
+        if "-v" not in sys.argv and "--verbose" not in sys.argv:
+            _silence_libraries()
+        code = run_command(sys.argv[1:])
+        # From here on the work is done, and a signal changes nothing.
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
+    except _Terminated:
+        code = TERMINATED
+    except _Interrupted:
+        code = INTERRUPTED
     with contextlib.suppress(OSError):
         sys.stdout.flush()
         sys.stderr.flush()

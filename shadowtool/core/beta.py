@@ -5,7 +5,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Fill
+from shadowtool.core.bands import bands
 from shadowtool.core.filling import fill_membrane
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plates import Plates
 
@@ -17,6 +19,7 @@ _LARGEST_HOLE = 0.005
 # Below this many standard deviations between L and S, β would be off by more than 0.1.
 _LEAST_CONTRAST = 10.0
 _WINDOW = 5
+_ONES = np.ones((1, 3), np.float32)
 # Half the contrast's reciprocal more noise in full light, and so many deviations to be sure.
 _LIT_NOISE, _SURE = 0.7, 3.0
 
@@ -32,15 +35,22 @@ def shadow_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> 
     Returns:
         (H, W) float32, not clipped; NaN where L = S in all channels or anything is NaN.
     """
-    image = image.astype(np.float32, copy=False)
-    above_red, above_green, above_blue = (image[..., c] - shadow[..., c] for c in range(3))
-    range_red, range_green, range_blue = (lit[..., c] - shadow[..., c] for c in range(3))
-    projection = above_red * range_red + above_green * range_green + above_blue * range_blue
-    length = range_red**2 + range_green**2 + range_blue**2
+    beta = np.empty(lit.shape[:2], np.float32)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        beta = projection / length
-    beta[~((length > 0) & np.isfinite(projection))] = np.nan
-    return np.asarray(beta, np.float32)
+        for rows in bands(beta.shape):
+            span = lit[rows] - shadow[rows]
+            above = to_float(image[rows]) - shadow[rows]
+            above *= span
+            span *= span
+            projection, length = _sum(above), _sum(span)
+            np.divide(projection, length, out=beta[rows])
+            beta[rows][~((length > 0) & np.isfinite(projection))] = np.nan
+    return beta
+
+
+def _sum(image: Float32) -> Float32:
+    """The sum of three channels, (H, W)."""
+    return np.asarray(cv2.transform(image, _ONES), np.float32)
 
 
 def coloured_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> Float32:
@@ -53,10 +63,13 @@ def coloured_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -
     Returns:
         (H, W, 3) float32, not clipped; NaN where L = S in the channel or anything is NaN.
     """
+    beta = np.empty(lit.shape, np.float32)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        beta = (image.astype(np.float32, copy=False) - shadow) / (lit - shadow)
-    beta[~np.isfinite(beta)] = np.nan
-    return np.asarray(beta, np.float32)
+        for rows in bands(beta.shape):
+            above = to_float(image[rows]) - shadow[rows]
+            np.divide(above, lit[rows] - shadow[rows], out=beta[rows])
+            beta[rows][~np.isfinite(beta[rows])] = np.nan
+    return beta
 
 
 def channel_contrast(plates: Plates, noise: NoiseModel) -> Float32:
@@ -74,14 +87,19 @@ def shadow_contrast(plates: Plates, noise: NoiseModel) -> Float32:
     Returns:
         (H, W) float32 ≥ 0; NaN where a plate is.
     """
-    span = plates.lit - plates.shadow
-    sigma = noise.sigma((plates.lit + plates.shadow) / 2)
-    length2 = (span**2).sum(axis=-1)
-    projected = np.sqrt((span**2 * sigma**2).sum(axis=-1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        contrast = length2 / projected
-    contrast[length2 == 0] = 0
-    return np.asarray(contrast, np.float32)
+    contrast = np.empty(plates.lit.shape[:2], np.float32)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        for rows in bands(contrast.shape):
+            lit, shadow = plates.lit[rows], plates.shadow[rows]
+            span = lit - shadow
+            sigma = noise.sigma((lit + shadow) / 2)
+            sigma *= span
+            sigma *= sigma
+            span *= span
+            length = _sum(span)
+            np.divide(length, np.sqrt(_sum(sigma)), out=contrast[rows])
+            contrast[rows][length == 0] = 0
+    return contrast
 
 
 def unknown_beta(contrast: Float32, frames: NDArray[np.uint32] | None) -> Bool:
@@ -116,22 +134,49 @@ def without_noise(beta: Float32, contrast: Float32) -> Float32:
     Returns:
         (H, W) float32 with the same NaN; within the range of what went in.
     """
+    result = np.empty_like(beta)
+    reach = _WINDOW // 2
+    height = beta.shape[0]
+    for rows in bands(beta.shape, channels=1):
+        above, below = min(rows.start, reach), min(height - rows.stop, reach)
+        taken = slice(rows.start - above, rows.stop + below)
+        cleared = _without_noise(beta[taken], contrast[taken])
+        result[rows] = cleared[above : cleared.shape[0] - below]
+    return result
+
+
+def _without_noise(beta: Float32, contrast: Float32) -> Float32:
+    """`without_noise` of a few rows, right but for what lies beyond them."""
     known = np.isfinite(beta) & np.isfinite(contrast) & (contrast > 0)
     # In the light the noise is larger than half-way, for which the contrast stands.
-    weight = np.where(known, contrast * np.float32(_LIT_NOISE), np.float32(0)) ** 2
-    values = np.where(known, beta, np.float32(1))
+    unknown = ~known
+    deviations = contrast * np.float32(_LIT_NOISE)
+    deviations[unknown] = 0
+    weight = deviations * deviations
+    values = beta.copy()
+    values[unknown] = 1
     total = _window_sum(weight)
     safe = np.maximum(total, np.float32(1e-12))
-    mean = _window_sum(weight * values) / safe
-    scatter = np.maximum(_window_sum(weight * values**2) / safe - mean**2, 0)
-    noise = _window_sum(known.astype(np.float32)) / safe
-    structure = np.maximum(scatter - noise, 0)
+    weighted = weight * values
+    mean = _window_sum(weighted)
+    mean /= safe
+    weighted *= values
+    scatter = _window_sum(weighted)
+    scatter /= safe
+    scatter -= mean * mean
+    noise = _window_sum(known.astype(np.float32))
+    noise /= safe
+    structure = np.maximum(scatter, 0) - noise
+    np.maximum(structure, 0, out=structure)
     keep = structure / (structure + 1 / np.maximum(weight, np.float32(1e-12)))
-    result = mean + keep * (values - mean)
+    keep *= values - mean
+    keep += mean
     lit = np.abs(1 - mean) * np.sqrt(total) < _SURE
-    lit &= np.abs(1 - values) * np.sqrt(weight) < _SURE + 1
-    result = np.where(lit & (structure < noise * _WINDOW**2), np.float32(1), result)
-    return np.where(known, result, beta).astype(np.float32)
+    lit &= np.abs(1 - values) * deviations < _SURE + 1
+    lit &= structure < noise * np.float32(_WINDOW**2)
+    keep[lit] = 1
+    np.copyto(keep, beta, where=unknown)
+    return np.asarray(keep, np.float32)
 
 
 def _window_sum(image: Float32) -> Float32:
@@ -184,8 +229,9 @@ def inpaint(image: Float32) -> Float32:
         return image
     if not known.any():
         return np.ones_like(image)
-    values = np.where(known, image, np.float32(0))[..., np.newaxis]
-    return fill_membrane(values, known.astype(np.float32))[..., 0]
+    values = image.copy()
+    values[~known] = 0
+    return fill_membrane(values[..., np.newaxis], known.astype(np.float32))[..., 0]
 
 
 def _small(mask: Bool) -> Bool:

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands, in_all_channels
+
 Float32 = NDArray[np.float32]
 
 
@@ -16,9 +18,11 @@ def shade(lit: Float32, shadow: Float32, beta: Float32) -> Float32:
     Returns:
         (H, W, 3) float32; exactly L' where β = 1 and S' where β = 0; NaN where an input is.
     """
-    visibility = beta if beta.ndim == 3 else beta[..., None]
-    result = visibility * lit
-    result += (1 - visibility) * shadow
+    result = np.empty_like(lit)
+    for rows in bands(lit.shape):
+        visibility = beta[rows] if beta.ndim == 3 else in_all_channels(beta[rows])
+        np.multiply(visibility, lit[rows], out=result[rows])
+        result[rows] += (1 - visibility) * shadow[rows]
     return result
 
 
@@ -29,8 +33,15 @@ def over(foreground: Float32, alpha: Float32, background: Float32) -> Float32:
         foreground: (H, W, 3), premultiplied, linear light.
         alpha: (H, W) in [0, 1].
         background: (H, W, 3).
+
+    Returns:
+        (H, W, 3) float32.
     """
-    return foreground + (1 - alpha[..., None]) * background
+    result = np.empty_like(background)
+    for rows in bands(alpha.shape):
+        np.multiply(1 - in_all_channels(alpha[rows]), background[rows], out=result[rows])
+        result[rows] += foreground[rows]
+    return result
 
 
 def shadow_ratio(shaded: Float32, lit: Float32) -> Float32:
@@ -40,5 +51,7 @@ def shadow_ratio(shaded: Float32, lit: Float32) -> Float32:
         (H, W, 3) float32 ≥ 0, 1 where the lit plate is black.
     """
     ratio = np.ones_like(shaded)
-    np.divide(shaded, lit, out=ratio, where=lit > 0)
-    return np.maximum(ratio, 0)
+    for rows in bands(shaded.shape):
+        np.divide(shaded[rows], lit[rows], out=ratio[rows], where=lit[rows] > 0)
+        np.maximum(ratio[rows], 0, out=ratio[rows])
+    return ratio

@@ -1,5 +1,7 @@
 """Giving unknown pixels the values of those around them."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -25,17 +27,25 @@ def fill_membrane(values: Float32, weight: Float32) -> Float32:
     Returns:
         (H, W, C) float32; all 0 if no pixel has any weight.
     """
-    known = weight > 0
-    if not known.any():
+    unknown = np.asarray(~(weight > 0))
+    if unknown.all():
         return np.zeros_like(values)
-    weight = np.where(known, np.maximum(weight / weight.max(), np.float32(1e-6)), np.float32(0))
     filled = values.copy()
-    labels, boxes = _parts(~known)
+    rows, columns = _around(cv2.boundingRect(unknown.view(np.uint8)), unknown.shape)
+    scaled = np.maximum(weight[rows, columns] / weight.max(), np.float32(1e-6))
+    scaled[unknown[rows, columns]] = 0
+    _fill_parts(filled[rows, columns], scaled)
+    return filled
+
+
+def _fill_parts(filled: Float32, weight: Float32) -> None:
+    """Fill each unknown part by itself, in place."""
+    values = filled.copy()
+    labels, boxes = _parts(weight == 0)
     for label, (rows, columns) in boxes.items():
         patch = _fill(values[rows, columns], np.ascontiguousarray(weight[rows, columns]))
         own = labels[rows, columns] == label
         filled[rows, columns][own] = patch[own]
-    return filled
 
 
 def _parts(
@@ -48,12 +58,18 @@ def _parts(
     )
     if count > _MOST_PARTS:
         return unknown.astype(np.int32), {1: (slice(0, height), slice(0, width))}
-    found = {}
-    for label, (x, y, w, h, _) in enumerate(boxes.tolist()[1:], start=1):
-        rows = slice(max(y - 2, 0), min(y + h + 2, height))
-        columns = slice(max(x - 2, 0), min(x + w + 2, width))
-        found[label] = (rows, columns)
+    found = {
+        label: _around(box[:4], unknown.shape)
+        for label, box in enumerate(boxes.tolist()[1:], start=1)
+    }
     return np.asarray(labels, np.int32), found
+
+
+def _around(box: Sequence[int], shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of a box (x, y, width, height) with the ring that holds what is in it."""
+    x, y, width, height = box
+    rows = slice(max(y - 2, 0), min(y + height + 2, shape[0]))
+    return rows, slice(max(x - 2, 0), min(x + width + 2, shape[1]))
 
 
 def _fill(values: Float32, weight: Float32) -> Float32:

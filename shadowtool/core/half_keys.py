@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import all_finite
+
 Int16 = NDArray[np.int16]
 Float32 = NDArray[np.float32]
 
@@ -79,7 +81,7 @@ def gray_keys(keys: Int16) -> Int16:
 
 def not_finite(halfs: NDArray[np.float16]) -> NDArray[np.bool_] | None:
     """Where a channel is NaN or infinite, (H, W) for (H, W, 3); None for nowhere."""
-    magnitude = np.ascontiguousarray(halfs).view(np.uint16) & np.uint16(0x7FFF)
-    if not magnitude.size or magnitude.max() < 0x7C00:
+    if all_finite(halfs):
         return None
+    magnitude = np.ascontiguousarray(halfs).view(np.uint16) & np.uint16(0x7FFF)
     return np.asarray((magnitude >= 0x7C00).any(axis=-1), bool)

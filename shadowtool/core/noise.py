@@ -48,8 +48,10 @@ class NoiseModel:
         Returns:
             (..., 3) float32, above 0 wherever ``floor`` is.
         """
-        variance = np.maximum(image, 0) * self.slope + self.floor
-        return np.asarray(np.sqrt(variance), np.float32)
+        variance = np.maximum(image, 0, dtype=np.float32)
+        variance *= self.slope.astype(np.float32)
+        variance += self.floor.astype(np.float32)
+        return np.asarray(np.sqrt(variance, out=variance), np.float32)
 
 
 @dataclass(frozen=True)
@@ -176,25 +178,29 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
         brighter = np.maximum(first[usable], second[usable])
         # The variance of a difference is twice that of one frame.
         difference = np.abs(first[usable] - second[usable]) / np.float32(np.sqrt(2))
+        count = len(difference) // _LEVELS
         spread = np.empty((4, _LEVELS, 3))
         for channel in range(3):
             order = np.argsort(brighter[:, channel], kind="stable")
-            for level, rows in enumerate(np.array_split(order, _LEVELS)):
-                own = difference[rows, channel]
-                median = np.median(own) / _NEAR[1]
-                spread[0, level, channel] = np.median(brighter[rows, channel])
-                spread[1, level, channel] = np.quantile(own, part[0]) / part[1]
-                spread[2, level, channel] = (own <= 0.1 * median).mean()
-                spread[3, level, channel] = _code_step(first[usable][rows, channel])
+            rows = order[: count * _LEVELS].reshape(_LEVELS, count)
+            own = difference[rows, channel]
+            middle, quantile = np.quantile(own, (0.5, part[0]), axis=1)
+            still = np.float32(0.1 / _NEAR[1]) * middle.astype(np.float32)
+            spread[0, :, channel] = np.median(brighter[rows, channel], axis=1)
+            spread[1, :, channel] = quantile / part[1]
+            spread[2, :, channel] = (own <= still[:, np.newaxis]).mean(axis=1)
+            spread[3, :, channel] = _code_steps(first[usable][rows, channel])
         spreads.append(spread)
     return spreads
 
 
-def _code_step(values: Float32) -> float:
-    """The distance of neighbouring code values in coarsely stored footage, next to 0 in fine."""
-    low, high = np.quantile(values, (0.05, 0.95))
-    distinct = np.unique(values[(values >= low) & (values <= high)])
-    return float(distinct[-1] - distinct[0]) / max(len(distinct) - 1, 1)
+def _code_steps(values: Float32) -> Float32:
+    """In each row (R, N), the distance of neighbouring code values in coarsely stored footage, next
+    to 0 in fine: (R,)."""
+    last = values.shape[1] - 1
+    inner = np.sort(values, axis=1)[:, int(np.ceil(0.05 * last)) : int(0.95 * last) + 1]
+    distinct = (np.diff(inner, axis=1) > 0).sum(axis=1)
+    return np.asarray((inner[:, -1] - inner[:, 0]) / np.maximum(distinct, 1), np.float32)
 
 
 def _non_negative_line(x: Float64, y: Float64) -> tuple[float, float]:

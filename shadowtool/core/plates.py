@@ -5,9 +5,12 @@ Eq. (4) of Chuang et al. 2003: S = min_f C_f, L = max_f C_f, each pixel and chan
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.half_keys import from_keys, not_finite, to_keys
 
 Float32 = NDArray[np.float32]
@@ -60,29 +63,34 @@ class ExtremePlates:
         Raises:
             ValueError: the shape differs from that of the first frame.
         """
-        keys = _order_keys(image)
         if self._lowest is None or self._highest is None or self._frames is None:
             # For halfs the integers that stand for infinity: both survive going over to floats.
-            infinity = _order_keys(np.full((1, 1, 3), np.inf, image.dtype))[0, 0, 0]
-            self._lowest = np.full(image.shape, infinity, keys.dtype)
-            self._highest = np.full(image.shape, ~infinity if keys.dtype == np.int16 else -infinity)
+            infinity = _order_keys(np.full((1, 1, 3), np.inf, image.dtype))
+            top = infinity[0, 0, 0]
+            bottom = ~top if infinity.dtype == np.int16 else -top
+            self._lowest = np.full(image.shape, top, infinity.dtype)
+            self._highest = np.full(image.shape, bottom, infinity.dtype)
             self._frames = np.zeros(image.shape[:2], np.uint32)
-        if keys.shape != self._lowest.shape:
-            raise ValueError(f"a frame of {keys.shape} among frames of {self._lowest.shape}")
-        if keys.dtype != self._lowest.dtype:
+        if image.shape != self._lowest.shape:
+            raise ValueError(f"a frame of {image.shape} among frames of {self._lowest.shape}")
+        mixed = (image.dtype == np.float16) != (self._lowest.dtype == np.int16)
+        if mixed:
             # Halfs and floats in one take: go on in float, which holds every half.
-            keys = _values(keys)
             self._lowest, self._highest = _values(self._lowest), _values(self._highest)
-        seen = seen_pixels(image, holdout)
-        if seen is None:
-            np.minimum(self._lowest, keys, out=self._lowest)
-            np.maximum(self._highest, keys, out=self._highest)
-            self._frames += np.uint32(1)
-        else:
-            where = seen[..., None]
-            np.minimum(self._lowest, keys, out=self._lowest, where=where)
-            np.maximum(self._highest, keys, out=self._highest, where=where)
-            self._frames += seen
+        for rows in bands(image.shape):
+            keys = _order_keys(image[rows])
+            keys = _values(keys) if mixed else keys
+            lowest, highest = self._lowest[rows], self._highest[rows]
+            seen = seen_pixels(image[rows], None if holdout is None else holdout[rows])
+            if seen is None:
+                np.minimum(lowest, keys, out=lowest)
+                np.maximum(highest, keys, out=highest)
+                self._frames[rows] += np.uint32(1)
+            else:
+                mask = seen.view(np.uint8)
+                cv2.copyTo(np.minimum(lowest, keys), mask, lowest)
+                cv2.copyTo(np.maximum(highest, keys), mask, highest)
+                self._frames[rows] += seen
 
     def plates(self) -> Plates:
         """The plates so far.
@@ -94,8 +102,9 @@ class ExtremePlates:
             raise ValueError("no frame was added")
         unseen = self._frames == 0
         lit, shadow = _values(self._highest), _values(self._lowest)
-        lit[unseen] = np.nan
-        shadow[unseen] = np.nan
+        if unseen.any():
+            lit[unseen] = np.nan
+            shadow[unseen] = np.nan
         return Plates(lit, shadow, self._frames.copy())
 
 
@@ -108,7 +117,7 @@ def _order_keys(image: NDArray[np.floating]) -> NDArray[np.int16] | Float32:
 
 def _values(keys: NDArray[np.int16] | Float32) -> Float32:
     if keys.dtype == np.int16:
-        return from_keys(keys.astype(np.int16)).astype(np.float32)
+        return to_float(from_keys(keys.astype(np.int16, copy=False)))
     return keys.astype(np.float32)
 
 

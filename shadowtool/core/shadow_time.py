@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plane_fits import fit_planes
 
@@ -44,8 +46,6 @@ LEAST_CONTRAST = 2 * (1 - float(_NEARLY_LIT))
 _KEPT_BYTES, _LEAST_KEPT, _MOST_KEPT = 2**28, 6, 24
 # Half the widths of the windows in which times are taken for linear, pixels.
 _WINDOWS = (2, 5)
-# Rows that are converted at a time.
-_ROWS = 32
 # Less than this part of the usual contrast is that of a pixel in shade.
 _SHADE = 0.3
 
@@ -80,10 +80,8 @@ class ShadowTimes:
 def luminance(image: NDArray[np.floating]) -> Float32:
     """(H, W, 3) linear RGB to (H, W) float32; not finite where a channel isn't."""
     gray = np.empty(image.shape[:2], np.float32)
-    # In bands that fit the cache: most of the work is the conversion to float.
-    for first in range(0, len(image), _ROWS):
-        band = slice(first, first + _ROWS)
-        gray[band] = cv2.transform(image[band].astype(np.float32), LUMA[np.newaxis])
+    for rows in bands(image.shape):
+        gray[rows] = cv2.transform(to_float(image[rows]), LUMA[np.newaxis])
     return gray
 
 

@@ -10,11 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import to_float
+
 Float32 = NDArray[np.float32]
 
 
 def _mirrored(curve: Callable[[Float32], Float32], values: NDArray[np.floating]) -> Float32:
-    single = np.asarray(values, np.float32)
+    single = to_float(np.asarray(values))
     return np.copysign(curve(np.abs(single)), single).astype(np.float32, copy=False)
 
 
@@ -66,7 +68,7 @@ def encode_rec709(linear: NDArray[np.floating]) -> Float32:
 
 
 def _identity(values: NDArray[np.floating]) -> Float32:
-    return np.asarray(values, np.float32)
+    return to_float(values)
 
 
 class Transfer(NamedTuple):

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines
 from shadowtool.core.shadow_time import ShadowTimes
 
@@ -18,6 +19,8 @@ Float64 = NDArray[np.float64]
 # Passes less far apart than this can't fix a point.
 LEAST_ANGLE = np.radians(10.0)
 _LEAST_WEIGHT = 1e-3
+# Outside any picture.
+_FAR = -1e6
 
 
 @dataclass(frozen=True)
@@ -141,19 +144,30 @@ def resample(image: NDArray[np.floating], warp: Float32, outside: float) -> Floa
     Returns:
         (H', W') or (H', W', C) float32.
     """
-    # A far but finite position instead of NaN: OpenCV's releases differ in what they make of NaN.
-    sane = np.nan_to_num(warp, nan=-1e6, posinf=-1e6, neginf=-1e6)
-    x, y = (np.ascontiguousarray(np.clip(sane[..., i], -1e6, 1e6)) for i in (0, 1))
+    return sample(image, positions(warp), outside)
+
+
+def positions(warp: Float32) -> Float32:
+    """W as `sample` takes it, (H', W', 2) float32: far outside instead of NaN.
+
+    OpenCV's releases differ in what they make of NaN.
+    """
+    known = np.isfinite(warp).all(axis=-1, keepdims=True)
+    return np.clip(np.where(known, warp, np.float32(_FAR)), _FAR, -_FAR)
+
+
+def sample(image: NDArray[np.floating], places: Float32, outside: float) -> Float32:
+    """`resample` by what `positions` gave: for one map and many pictures."""
     channels = image.shape[2] if image.ndim == 3 else 1
-    result = cv2.remap(
-        np.ascontiguousarray(image, np.float32),
-        x,
-        y,
+    result = cv2.remap(  # type: ignore[call-overload]
+        np.ascontiguousarray(to_float(image)),
+        places,
+        None,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=(outside,) * min(channels, 4),
     )
-    return np.asarray(result, np.float32).reshape(*warp.shape[:2], *image.shape[2:])
+    return np.asarray(result, np.float32).reshape(*places.shape[:2], *image.shape[2:])
 
 
 def to_st_map(warp: Float32, width: int, height: int) -> Float32:

@@ -7,8 +7,9 @@ import os
 import socket
 import threading
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from shadowtool.errors import InputError, RetryError, ShadowtoolError
 
@@ -21,6 +22,48 @@ _RETRY = {
 _HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
 _SAMPLE, _SAMPLES = 1 << 16, 256
 _counter = itertools.count()
+
+
+class Content(NamedTuple):
+    """What is in a file, and its `fingerprint`."""
+
+    data: bytes
+    fingerprint: str
+
+
+class _Held(threading.local):
+    """What `reading_once` holds for the thread."""
+
+    def __init__(self) -> None:
+        self.contents: dict[Path, Content] = {}
+
+
+_held = _Held()
+
+
+@contextlib.contextmanager
+def reading_once(paths: Sequence[Path]) -> Iterator[list[str]]:
+    """Read files and give their fingerprints; until it ends, this thread reads them from memory.
+
+    So what is worked on is what the fingerprint says, even if the file changes meanwhile.
+
+    Raises:
+        InputError, RetryError: as `read_bytes`.
+    """
+    contents = {path: read_content(path) for path in paths}
+    before, _held.contents = _held.contents, contents
+    try:
+        yield [contents[path].fingerprint for path in paths]
+    finally:
+        _held.contents = before
+
+
+def read_content(path: Path) -> Content:
+    """The file's content with its fingerprint. Raises as `read_bytes`."""
+    if path in _held.contents:
+        return _held.contents[path]
+    data = read_bytes(path)
+    return Content(data, fingerprint(data))
 
 
 def read_bytes(path: Path) -> bytes:
@@ -40,6 +83,9 @@ def read_bytes(path: Path) -> bytes:
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
     """Put a file in place at once: a temporary beside it, then a rename.
+
+    It isn't forced to the disk, which takes longer than most frames do: after a power cut a file
+    may be empty, which resuming notices.
 
     Raises:
         RetryError: disk full, stale file handle and the like.

@@ -10,7 +10,7 @@ import logging
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -21,9 +21,11 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import to_float
+from shadowtool.core.half_floats import to_half as to_half
 from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import DamagedFileError, InputError, ShadowtoolError
-from shadowtool.io.files import fingerprint, read_bytes, write_bytes
+from shadowtool.io.files import Content, read_content, write_bytes
 
 logger = logging.getLogger(__name__)
 
@@ -48,6 +50,7 @@ class Header:
         pixel_aspect: width of a pixel over its height.
         frame_rate: frames per second, if the file says so.
         time_code: OpenEXR's TimeCode, if the file has one.
+        coloured: whether there is more than one channel.
         provenance: how a file of ours was made: our attributes without their prefix.
     """
 
@@ -57,6 +60,7 @@ class Header:
     pixel_aspect: float = 1.0
     frame_rate: Fraction | None = None
     time_code: Any = None
+    coloured: bool = True
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -92,9 +96,7 @@ class Image:
         """
         name = self._colour_layer()
         values = self.layers[name]
-        if values.ndim == 2:
-            values = np.repeat(values[..., None], 3, axis=-1)
-        return decode(np.ascontiguousarray(values[..., :3]), resolve_transfer(transfer, self.path))
+        return decode(_three_channels(values), resolve_transfer(transfer, self.path))
 
     def rgba(self, transfer: str = "auto") -> tuple[Float32, Float32]:
         """Premultiplied colour (H, W, 3) and alpha (H, W), linear light.
@@ -108,8 +110,8 @@ class Image:
         values = self.layers[name]
         if values.ndim == 2 or values.shape[-1] < 4:
             raise InputError(f"{self.path}: has no alpha channel; give frames with R, G, B and A")
-        alpha = _unit(values[..., 3])
-        colour = self.rgb(transfer).astype(np.float32)
+        alpha = _unit(_one_channel(values, 3))
+        colour = to_float(self.rgb(transfer))
         if self.path.suffix.lower() == PNG:
             colour = colour * alpha[..., None]
         return colour, alpha
@@ -134,7 +136,7 @@ class Image:
         if len(only) == 1 and only[0].ndim == 2:
             return _unit(only[0])
         if len(only) == 1 and next(iter(self.layers)) == "RGB":
-            return _unit(only[0][..., 1])
+            return _unit(_one_channel(only[0], 1))
         raise InputError(
             f"{self.path}: has no channel {' or '.join(names)}, only {', '.join(self.layers)}"
         )
@@ -149,8 +151,12 @@ class Image:
             if layer == name and values.ndim == 2:
                 return _unit(values)
             if layer in ("RGB", "RGBA") and len(name) == 1 and name in layer:
-                return _unit(values[..., layer.index(name)])
+                return _unit(_one_channel(values, layer.index(name)))
         raise InputError(f"{self.path}: has no channel {name}, only {', '.join(self.layers)}")
+
+    def part(self, rows: slice) -> "Image":
+        """Some rows of the picture; nothing is copied."""
+        return replace(self, layers={name: values[rows] for name, values in self.layers.items()})
 
     def _colour_layer(self) -> str:
         for name in ("RGB", "RGBA"):
@@ -178,7 +184,7 @@ def resolve_transfer(transfer: str, path: Path) -> str:
 def decode(values: NDArray[Any], transfer: str) -> NDArray[np.floating]:
     """Code values of any stored type to linear light; halfs that are linear stay as they are."""
     if values.dtype in (np.uint8, np.uint16):
-        return np.asarray(_table(transfer, values.dtype.name)[values])
+        return np.asarray(cv2.LUT(values, _table(transfer, values.dtype.name)))
     if transfer in ("linear", "none"):
         return values
     return TRANSFERS[transfer].decode(values)
@@ -190,10 +196,29 @@ def _table(transfer: str, dtype: str) -> Float32:
     return TRANSFERS[transfer].decode(np.arange(top + 1, dtype=np.float32) / top)
 
 
+def _three_channels(values: NDArray[Any]) -> NDArray[Any]:
+    """(H, W), (H, W, 3) or (H, W, 4) as (H, W, 3) without the alpha; grey in each channel."""
+    bits = _for_opencv(values)
+    if values.ndim == 2:
+        return cv2.merge([bits, bits, bits]).view(values.dtype)
+    return values if values.shape[2] == 3 else cv2.merge(cv2.split(bits)[:3]).view(values.dtype)
+
+
+def _one_channel(values: NDArray[Any], index: int) -> NDArray[Any]:
+    """(H, W) of (H, W, C)."""
+    return cv2.extractChannel(_for_opencv(values), index).view(values.dtype)
+
+
+def _for_opencv(values: NDArray[Any]) -> NDArray[Any]:
+    # What only moves channels about takes halfs fastest as integers of their size.
+    kind = {np.dtype(np.float16): np.uint16, np.dtype(np.uint32): np.float32}
+    return values.view(kind.get(values.dtype, values.dtype))
+
+
 def _unit(values: NDArray[Any]) -> Float32:
     if values.dtype in (np.uint8, np.uint16):
         return values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
-    return np.ascontiguousarray(values, np.float32)
+    return to_float(values)
 
 
 def read_header(path: Path) -> Header:
@@ -221,10 +246,10 @@ def read_image(path: Path) -> Image:
         InputError: as `read_header`.
         DamagedFileError: cut off, or the pixels don't decode.
     """
-    data = read_bytes(path)
+    content = read_content(path)
     if path.suffix.lower() == PNG:
-        return _decode_png(path, data)
-    return _decode_exr(path, data)
+        return _decode_png(path, content)
+    return _decode_exr(path, content)
 
 
 def write_exr(
@@ -298,11 +323,6 @@ def write_png(
     write_bytes(path, data[:33] + texts + data[33:])
 
 
-def to_half(values: NDArray[np.floating]) -> NDArray[np.float16]:
-    """Round to half floats; what is too large becomes the largest half, NaN stays."""
-    return np.asarray(np.clip(values, -65504, 65504), np.float16)
-
-
 def to_code(linear: NDArray[np.floating], transfer: str = "srgb") -> NDArray[np.uint16]:
     """Linear light to 16-bit code values; NaN becomes 0."""
     coded = TRANSFERS[transfer].encode(linear)
@@ -345,6 +365,7 @@ def _exr_header(path: Path, file: Any) -> Header:
         pixel_aspect=aspect if np.isfinite(aspect) and aspect > 0 else 1.0,
         frame_rate=rate if isinstance(rate, Fraction) else None,
         time_code=raw.get("timeCode"),
+        coloured=len(names) > 1,
         provenance={
             key.removeprefix(_ATTRIBUTE): value
             for key, value in raw.items()
@@ -364,16 +385,16 @@ def _window(path: Path, raw: Mapping[str, Any], name: str) -> tuple[Corner, Corn
     return (first[0], first[1]), (last[0], last[1])
 
 
-def _decode_exr(path: Path, data: bytes) -> Image:
+def _decode_exr(path: Path, content: Content) -> Image:
     # The header first: a picture that is refused must not be decoded, and a damaged part of a
     # multi-part file vanishes without a word when the pixels are read.
-    listed = _open_exr(path, io.BytesIO(data), header_only=True)
+    listed = _open_exr(path, io.BytesIO(content.data), header_only=True)
     header = _exr_header(path, listed)
     try:
-        file = _open_exr(path, io.BytesIO(data))
+        file = _open_exr(path, io.BytesIO(content.data))
     except DamagedFileError:
         # OpenEXR joins R, G, B to one array only where they are of one type.
-        file = _open_exr(path, io.BytesIO(data), separate=True)
+        file = _open_exr(path, io.BytesIO(content.data), separate=True)
     if len(file.parts) != len(listed.parts):
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
     if len(file.parts) > 1:
@@ -392,7 +413,7 @@ def _decode_exr(path: Path, data: bytes) -> Image:
         names = [name for name in "RGBA" if name in layers]
         colour = np.stack([layers.pop(name).astype(np.float32) for name in names], axis=-1)
         layers["".join(names)] = colour
-    return Image(path, header, layers, fingerprint(data))
+    return Image(path, header, layers, content.fingerprint)
 
 
 def _placed(values: NDArray[Any], first: tuple[int, int], header: Header) -> NDArray[Any]:
@@ -420,7 +441,8 @@ def _png_header(path: Path, data: bytes) -> Header:
     width, height = struct.unpack(">II", data[16:24])
     if not 0 < width * height <= _MOST_PIXELS:
         raise InputError(f"{path}: claims {width}x{height} pixels; that can't be right")
-    return Header(width, height, provenance=_png_texts(data))
+    # The ninth byte of IHDR: 0 is grey alone.
+    return Header(width, height, coloured=data[25] != 0, provenance=_png_texts(data))
 
 
 def _png_texts(data: bytes) -> dict[str, str]:
@@ -461,7 +483,8 @@ def _png_text(key: str, value: str) -> bytes:
         return _png_chunk(b"iTXt", key.encode("ascii") + b"\0\0\0\0\0" + text)
 
 
-def _decode_png(path: Path, data: bytes) -> Image:
+def _decode_png(path: Path, content: Content) -> Image:
+    data = content.data
     header = _png_header(path, data)
     # A cut-off PNG decodes to a picture that is grey from there on; its end marker is missing.
     whole = any(kind == b"IEND" for kind, _ in _png_chunks(data))
@@ -477,4 +500,4 @@ def _decode_png(path: Path, data: bytes) -> Image:
         layers = {"RGBA": cv2.cvtColor(values, cv2.COLOR_BGRA2RGBA)}
     else:
         layers = {"RGB": cv2.cvtColor(values, cv2.COLOR_BGR2RGB)}
-    return Image(path, header, layers, fingerprint(data))
+    return Image(path, header, layers, content.fingerprint)

@@ -34,6 +34,9 @@ LINES = "lines.json"
 SCAN = "scan.exr"
 WARP = "warp.exr"
 
+# In pictures' widths or heights, from the middle.
+_FAR_OUTSIDE = 2.0
+
 Provenance = Mapping[str, str]
 
 
@@ -214,10 +217,11 @@ def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
     """Read an ST map as W in pixels of a source picture of the map's own size.
 
     Raises:
-        InputError: it has no R and G.
+        InputError: it has no R and G, or is plainly another kind of picture.
     """
     image = read_image(path)
     st_map = np.stack([image.channel("R"), image.channel("G")], axis=-1)
+    _require_st_map(image, st_map)
     height, width = st_map.shape[:2]
     layer = image.layers.get("RGBA")
     error = (
@@ -226,6 +230,18 @@ def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
         else error_of_confidence(layer[..., 3].astype(np.float32))
     )
     return WarpMap(from_st_map(st_map, width, height), error), image.header, image.fingerprint
+
+
+def _require_st_map(image: Image, st_map: NDArray[np.float32]) -> None:
+    step = image.header.provenance.get("command", "shadowtool warp").split()[1:2]
+    if step != ["warp"]:
+        raise InputError(f"{image.path}: was made by `shadowtool {''.join(step)}`, is no ST map")
+    known = st_map[np.isfinite(st_map).all(axis=-1)]
+    # A map in pixels, or of displacements, has most of its values elsewhere.
+    if not known.size or np.median(np.abs(known - 0.5)) > _FAR_OUTSIDE:
+        raise InputError(
+            f"{image.path}: is no ST map: R and G are to be u and v, 0 to 1 across the picture"
+        )
 
 
 def read_record(path: Path) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from fileseq.frameset import FrameSet
 
 from shadowtool.choices import Missing
 from shadowtool.errors import InputError, OptionError
+from shadowtool.io.files import is_file
 from shadowtool.io.image import EXR, PNG
 
 Frame = int | Decimal
@@ -198,11 +199,9 @@ class _Found(NamedTuple):
 
 def _sequences(folder: Path) -> list[_Found]:
     names = sorted(
-        entry.name
-        for entry in os.scandir(folder)
-        if not entry.name.startswith(".")
-        and Path(entry.name).suffix.lower() in (EXR, PNG)
-        and entry.is_file()
+        path.name
+        for path in folder.iterdir()
+        if not path.name.startswith(".") and path.suffix.lower() in (EXR, PNG) and is_file(path)
     )
     try:
         found = findSequencesInList(names)

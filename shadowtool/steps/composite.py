@@ -7,17 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Fill, Format
+from shadowtool.core.bands import bands
 from shadowtool.core.beta import inpaint
 from shadowtool.core.compositing import over, shade, shadow_ratio
 from shadowtool.core.filling import fill_membrane
-from shadowtool.core.warp_map import WarpMap, resample
+from shadowtool.core.half_floats import to_float, to_half
+from shadowtool.core.warp_map import positions, sample
 from shadowtool.errors import InputError
 from shadowtool.io.image import (
     EXR,
     PNG,
+    Header,
+    Image,
     read_image,
     to_code,
-    to_half,
     write_exr,
     write_png,
 )
@@ -68,12 +71,11 @@ def composite(
     header = stored.header
     for sequence in (figure_frames, beta_frames):
         require_frames(sequence, frames, header, f"the plates in {plates}", run.missing)
-    warp_map: WarpMap | None = None
+    places: Float32 | None = None
     shared = [stored.fingerprint]
     if warp is not None:
         warp = warp / WARP if warp.is_dir() else warp
-        warp_map, warp_header, mark = read_warp(warp)
-        require_size(warp, warp_header, header, f"the plates in {plates}")
+        places, mark = _places(warp, header, f"the plates in {plates}")
         shared.append(mark)
     suffix = EXR if file_format == "exr" else PNG
     name = output.resolve().name
@@ -104,25 +106,28 @@ def composite(
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
         visibility, unknown = _visibility(beta_frames, frame, fill)
         figure = read_image(figure_frames.path(frame))
-        colour, alpha = figure.rgba()
-        bad = ~(np.isfinite(colour).all(axis=-1) & np.isfinite(alpha))
-        alpha = np.clip(np.where(bad, np.float32(0), alpha), 0, 1)
-        colour = np.where(bad[..., None], np.float32(0), colour)
-        if warp_map is not None:
-            visibility = resample(visibility, warp_map.warp, outside=1.0)
-        shaded = shade(lit, shadow, visibility)
-        result = over(colour, alpha, shaded)
-        figures = {"unknown": unknown, "not_finite": int(bad.sum())}
+        if places is not None:
+            visibility = sample(visibility, places, outside=1.0)
+        result = np.empty(lit.shape, np.float16 if suffix == EXR else np.uint16)
+        ratios = np.empty(lit.shape, np.float16) if ratio else None
+        bad = 0
+        for rows in bands(lit.shape):
+            colour, alpha, own = _figure(figure.part(rows))
+            bad += own
+            shaded = shade(lit[rows], shadow[rows], visibility[rows])
+            coded = over(colour, alpha, shaded)
+            result[rows] = to_half(coded) if suffix == EXR else to_code(coded)
+            if ratios is not None:
+                ratios[rows] = to_half(shadow_ratio(shaded, lit[rows]))
+        figures = {"unknown": unknown, "not_finite": bad}
         marked = with_figures(provenance, figures)
-        target, *ratios = products(frame)
-        frame_header = figure.header
+        target, *more = products(frame)
         if suffix == EXR:
-            write_exr(target, {"RGB": to_half(result)}, frame_header, marked)
+            write_exr(target, {"RGB": result}, figure.header, marked)
         else:
-            write_png(target, to_code(result), marked)
-        for path in ratios:
-            values = to_half(shadow_ratio(shaded, lit))
-            write_exr(path, {"RGB": values}, frame_header, marked)
+            write_png(target, result, marked)
+        if ratios is not None:
+            write_exr(more[0], {"RGB": ratios}, figure.header, marked)
         return figures
 
     def summary(rows: list[Figures]) -> Figures:
@@ -144,11 +149,18 @@ def _part(mattes: Path | None, folder: str) -> Path:
     return part
 
 
+def _places(warp: Path, header: Header, of: str) -> tuple[Float32, str]:
+    """Where an ST map takes β from, and its fingerprint."""
+    warp_map, warp_header, mark = read_warp(warp)
+    require_size(warp, warp_header, header, of)
+    return positions(warp_map.warp), mark
+
+
 def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:
     """β of a frame, (H, W) or (H, W, 3), and how many of its pixels are unknown."""
     image = read_image(sequence.path(frame))
-    colour = image.layers.get("RGB")
-    values = image.plane("Y") if colour is None else image.rgb("none").astype(np.float32)
+    coloured = "RGB" in image.layers
+    values = to_float(image.rgb("none")) if coloured else image.plane("Y")
     holes = ~np.isfinite(values)
     if holes.any():
         values = np.where(holes, np.float32(np.nan), values)
@@ -159,6 +171,19 @@ def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, 
         elif fill == "inpaint":
             values = np.dstack([inpaint(values[..., c]) for c in range(3)])
     return values, int(holes.any(axis=-1).sum() if holes.ndim == 3 else holes.sum())
+
+
+def _figure(image: Image) -> tuple[Float32, Float32, int]:
+    """Premultiplied colour (H, W, 3), alpha (H, W) in [0, 1], and in how many pixels there is NaN
+    or infinity, which becomes nothing."""
+    colour, alpha = image.rgba()
+    count = 0
+    if not (np.isfinite(colour).all() and np.isfinite(alpha).all()):
+        bad = ~(np.isfinite(colour).all(axis=-1) & np.isfinite(alpha))
+        count = int(bad.sum())
+        alpha[bad] = 0
+        colour[bad] = 0
+    return colour, np.clip(alpha, 0, 1), count
 
 
 def _complete(lit: Float32, shadow: Float32) -> tuple[Float32, Float32, int]:

@@ -42,7 +42,7 @@ class Footage:
             InputError, DamagedFileError: it can't be read, or is of another size.
         """
         image = read_image(self.sequence.path(frame))
-        require_size(image.path, image.header, self.header, self.sequence.pattern)
+        _require_same(image.path, image.header, self.header, self.sequence.pattern)
         return image
 
     def read(self, frame: Frame) -> NDArray[np.floating]:
@@ -75,7 +75,7 @@ def open_footage(
     """Open a sequence and look at every header, so that misfits are found before any work.
 
     Raises:
-        InputError: nothing there, two sequences, mixed sizes, or a kind of file that is refused.
+        InputError: nothing there, two sequences, mixed sizes or kinds, or files that are refused.
         DamagedFileError: a header is damaged and ``missing`` is "error".
     """
     sequence = open_sequence(source, role)
@@ -89,10 +89,20 @@ def open_footage(
             continue
         if first is None:
             first = header
-        require_size(path, header, first, sequence.pattern)
+        _require_same(path, header, first, sequence.pattern)
     if first is None:
         raise DamagedFileError(f"{sequence.pattern}: no frame can be read")
     return Footage(sequence, first, resolve_transfer(transfer, next(iter(sequence.files.values()))))
+
+
+def _require_same(path: Path, header: Header, first: Header, of: str) -> None:
+    require_size(path, header, first, of)
+    if header.coloured != first.coloured:
+        kinds = ("a single channel", "colour")
+        raise InputError(
+            f"{path}: has {kinds[header.coloured]}, but {of} has {kinds[first.coloured]};"
+            " give frames of one kind"
+        )
 
 
 def require_frames(

@@ -136,7 +136,10 @@ def plate(
         **more,
     }
     if unseen == contrast.size:
-        raise InputError(f"{footage.sequence.pattern}: the holdout leaves nothing of any frame")
+        why = "no pixel is finite in any frame"
+        if take.held_out() != "nothing":
+            why = "the holdout, or NaN, leaves nothing of any frame"
+        raise InputError(f"{footage.sequence.pattern}: {why}")
     if unseen:
         part = 100 * unseen / contrast.size
         logger.warning("%s: %d pixels (%.2f%%) were seen in no frame", output, unseen, part)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,11 +12,13 @@ from typing import Any
 from shadowtool import __version__
 from shadowtool.choices import Missing
 from shadowtool.errors import DamagedFileError, InputError, OutputExistsError
-from shadowtool.io.files import fingerprint_file, is_file, new_folders
+from shadowtool.io.files import is_file, new_folders, reading_once
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame
 from shadowtool.parallel import ordered_map
+
+logger = logging.getLogger(__name__)
 
 Progress = Callable[[int, int], None]
 Figures = dict[str, Any]
@@ -174,17 +177,18 @@ class FrameWork:
                 run.progress(number, len(frames))
             if not rows:
                 raise InputError(f"{self.output}: no frame could be made; all are skipped")
+        _warn_of_nan(self.output, rows)
         figures = self._record(rows, summary)
         done = [frame for frame in frames if str(frame) in rows]
         return Result(self.recipe.step, self.output, done, kept, skipped, figures)
 
     def _frame(self, frame: Frame, run: Run) -> tuple[Figures, bool] | None:
         try:
-            inputs = [fingerprint_file(path) for path in self.sources(frame)]
-            mark = self.recipe.fingerprint([*self.shared, *inputs])
-            if run.resume and (figures := current(self.products(frame), mark)) is not None:
-                return {"fingerprint": mark, **figures}, True
-            figures = self.make(frame, self.recipe.provenance(mark))
+            with reading_once(self.sources(frame)) as inputs:
+                mark = self.recipe.fingerprint([*self.shared, *inputs])
+                if run.resume and (figures := current(self.products(frame), mark)) is not None:
+                    return {"fingerprint": mark, **figures}, True
+                figures = self.make(frame, self.recipe.provenance(mark))
         except (DamagedFileError, InputError):
             if run.missing == "skip":
                 return None
@@ -197,11 +201,23 @@ class FrameWork:
         key = self.recipe.fingerprint(self.shared)
         with folder_lock(self.output):
             before = read_record(self.output / MANIFEST)
-            if before.get("fingerprint") == key and isinstance(before.get("frames"), dict):
-                rows = {**before["frames"], **rows}
-            figures = summary(list(rows.values()))
-            write_manifest(self.output, self.recipe, key, figures, rows)
+            others = before.get("frames") if before.get("fingerprint") == key else None
+            try:
+                merged = {**others, **rows} if isinstance(others, dict) else rows
+                figures = summary(list(merged.values()))
+            except (AttributeError, TypeError, ValueError, OverflowError):
+                # Somebody else's hand has been in the record; what was made now is known.
+                merged, figures = rows, summary(list(rows.values()))
+            write_manifest(self.output, self.recipe, key, figures, merged)
         return figures
+
+
+def _warn_of_nan(output: Path, rows: Mapping[str, Figures]) -> None:
+    found = {frame: row["not_finite"] for frame, row in rows.items() if row.get("not_finite")}
+    if found:
+        named = ", ".join(f"{frame} ({count})" for frame, count in list(found.items())[:10])
+        more = f" and {len(found) - 10} more" if len(found) > 10 else ""
+        logger.warning("%s: pixels that are NaN or infinite in frames %s%s", output, named, more)
 
 
 def with_figures(provenance: dict[str, str], figures: Figures) -> dict[str, str]:
@@ -220,7 +236,7 @@ def current(files: list[Path], mark: str) -> Figures | None:
             if provenance.get("fingerprint") != mark:
                 return None
             figures.update(json.loads(provenance.get("figures", "{}")))
-        except (InputError, ValueError):
+        except (InputError, ValueError, TypeError, RecursionError):
             return None
     return figures
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.pictures import time_picture
 from shadowtool.core.plane_fits import reach
@@ -34,7 +35,7 @@ from shadowtool.io.files import fingerprint_file, make_folder
 from shadowtool.io.image import write_png
 from shadowtool.io.products import LINES, MANIFEST, SCAN, write_scan
 from shadowtool.io.sequence import Frame
-from shadowtool.parallel import bands, ordered_map
+from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import Footage, open_footage
 from shadowtool.steps.plane import read_plane
 from shadowtool.steps.run import (
@@ -178,7 +179,7 @@ def _times(
         found = refined_times(own[rows], own_error[rows], crossings.at[rows])
         return rows, inner, found
 
-    for rows, inner, found in ordered_map(refine, bands(len(own), reach()), jobs):
+    for rows, inner, found in ordered_map(refine, overlapping_bands(len(own), reach()), jobs):
         for whole, part in zip((time, error), found, strict=True):
             whole[rows][inner] = part[inner]
     # From positions among the frames to frame numbers, which may be further apart.

@@ -6,12 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.epipole import Epipole, find_epipole
 from shadowtool.core.parallax import measure_parallax
 from shadowtool.core.plane_fits import fit_planes, radii_for, reach
 from shadowtool.core.shadow_lines import line_speed
 from shadowtool.core.warp_map import Pass, WarpMap, identity_map, intersect
-from shadowtool.parallel import bands, ordered_map
+from shadowtool.parallel import ordered_map
 from shadowtool.steps.run import Progress, no_progress
 
 Float32 = NDArray[np.float32]
@@ -58,7 +59,7 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
         return own_rows, WarpMap(part.warp[inner], part.error[inner])
 
     whole = WarpMap(np.empty((height, width, 2), np.float32), np.empty((height, width), np.float32))
-    cuts = bands(height, reach(radii))
+    cuts = overlapping_bands(height, reach(radii))
     progress(0, len(cuts))
     for done, (rows, part) in enumerate(ordered_map(band, cuts, jobs), start=1):
         whole.warp[rows], whole.error[rows] = part.warp, part.error

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from shadowtool.core.bands import bands
 from shadowtool.core.diffusion import diffuse
 from shadowtool.core.epipole import Epipole
+from shadowtool.core.half_floats import to_float, to_half
 from shadowtool.core.inverse_map import compose, invert
 from shadowtool.core.pictures import warp_picture
 from shadowtool.core.warp_map import (
@@ -16,11 +18,12 @@ from shadowtool.core.warp_map import (
     WarpMap,
     identity_map,
     pass_angles,
-    resample,
+    positions,
+    sample,
 )
 from shadowtool.errors import OptionError, ReshootError
 from shadowtool.io.files import is_file, make_folder
-from shadowtool.io.image import EXR, Header, read_header, read_image, to_half, write_exr, write_png
+from shadowtool.io.image import EXR, Header, read_header, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, WARP, read_scan, read_warp, write_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_size
@@ -223,16 +226,17 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     def products(frame: Frame) -> list[Path]:
         return [frames.place(frame)]
 
+    places = positions(warp_map.warp)
+
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
         image = read_image(sequence.path(frame))
-        scaled = _scaled(warp_map, header, image.header)
+        scaled = _scaled(places, header, image.header)
         layers = {}
         for name, values in image.layers.items():
             edge = 0.0 if name == "confidence" else outside
             plain = image.rgb("none") if values.dtype.kind == "u" and values.ndim == 3 else values
             single = image.plane(name) if values.ndim == 2 else plain
-            warped = resample(single, scaled, edge)
-            layers[name] = warped if values.dtype == np.float32 else to_half(warped)
+            layers[name] = _warped(single, scaled, edge, values.dtype == np.float32)
         write_exr(products(frame)[0], layers, image.header, provenance)
         return {}
 
@@ -243,12 +247,23 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     return work.run(frames.present, run, frames.absent)
 
 
-def _scaled(warp_map: WarpMap, header: Header, source: Header) -> np.ndarray:
-    """W for a source picture of another size than the map's: an ST map knows no size."""
+def _warped(image: np.ndarray, places: np.ndarray, edge: float, single: bool) -> np.ndarray:
+    """The image at these places, as single or half floats."""
+    shape = (*places.shape[:2], *image.shape[2:])
+    result = np.empty(shape, np.float32 if single else np.float16)
+    image = to_float(image)
+    for rows in bands(shape):
+        values = sample(image, places[rows], edge)
+        result[rows] = values if single else to_half(values)
+    return result
+
+
+def _scaled(places: np.ndarray, header: Header, source: Header) -> np.ndarray:
+    """Positions in a picture of another size than the map's: an ST map knows no size."""
     if source.size == header.size:
-        return warp_map.warp
+        return places
     factor = np.array(source.size, np.float32) / np.array(header.size, np.float32)
-    return ((warp_map.warp + 0.5) * factor - 0.5).astype(np.float32)
+    return ((places + 0.5) * factor - 0.5).astype(np.float32)
 
 
 def _figures(scans: _Scans, measured: WarpMap, epipole: Epipole | None) -> Figures:

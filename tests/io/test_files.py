@@ -18,6 +18,8 @@ from shadowtool.io.files import (
     fingerprint_file,
     make_folder,
     read_bytes,
+    read_content,
+    reading_once,
     write_bytes,
 )
 
@@ -260,3 +262,37 @@ def test_a_files_fingerprint_is_its_contents(tmp_path):
 def test_the_fingerprint_of_a_missing_file_is_an_error(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         fingerprint_file(tmp_path / "a")
+
+
+def test_what_is_held_is_what_the_fingerprint_says_though_the_file_changes(tmp_path):
+    one, other = tmp_path / "a", tmp_path / "b"
+    one.write_bytes(b"first")
+    other.write_bytes(b"other")
+    with reading_once([one, other, one]) as marks:
+        one.write_bytes(b"second")
+        other.unlink()
+        assert marks == [fingerprint(b"first"), fingerprint(b"other"), fingerprint(b"first")]
+        assert read_content(one) == (b"first", fingerprint(b"first"))
+        assert read_content(other).data == b"other"
+    assert read_content(one) == (b"second", fingerprint(b"second"))
+
+
+def test_what_is_held_is_held_for_its_own_thread(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"first")
+    seen = []
+    with reading_once([path]):
+        path.write_bytes(b"second")
+        thread = threading.Thread(target=lambda: seen.append(read_content(path).data))
+        thread.start()
+        thread.join()
+    assert seen == [b"second"]
+
+
+def test_nothing_is_held_after_a_failure(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"first")
+    with pytest.raises(InputError, match="nowhere"), reading_once([path, tmp_path / "nowhere"]):
+        pass
+    path.write_bytes(b"second")
+    assert read_content(path).data == b"second"

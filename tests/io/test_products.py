@@ -35,7 +35,7 @@ from shadowtool.io.products import (
 
 WIDTH, HEIGHT = 7, 5
 HEADER = Header(WIDTH, HEIGHT)
-MADE = {"version": "1", "command": "shadowtool test", "fingerprint": "f"}
+MADE = {"version": "1", "command": "shadowtool warp", "fingerprint": "f"}
 
 
 def write_plates(folder, plates, contrast, header, provenance):

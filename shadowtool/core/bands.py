@@ -1,0 +1,44 @@
+"""Working through a picture a few rows at a time, so that what is in hand stays in the cache."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+# Values in a band: a handful of arrays of as many single floats are 2 MB.
+_VALUES = 3 << 15
+
+
+def bands(shape: tuple[int, ...], channels: int = 3) -> Iterator[slice]:
+    """Rows of a picture (H, W, ...) from top to bottom, as many at a time as are worked on fastest.
+
+    Args:
+        channels: of the arrays that are made on the way.
+    """
+    height, width = shape[:2]
+    step = max(1, _VALUES // max(width * channels, 1))
+    for start in range(0, height, step):
+        yield slice(start, min(start + step, height))
+
+
+def overlapping_bands(height: int, reach: int, rows: int = 128) -> list[tuple[slice, slice]]:
+    """Rows of a picture of which each result depends on others around it.
+
+    Args:
+        reach: how far, pixels.
+
+    Returns:
+        For each band the rows that are to be read, and where in these its own rows lie.
+    """
+    cut = []
+    for first in range(0, height, rows):
+        last = min(first + rows, height)
+        start, stop = max(first - reach, 0), min(last + reach, height)
+        cut.append((slice(start, stop), slice(first - start, last - start)))
+    return cut
+
+
+def in_all_channels(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H, W) as (H, W, 3), the same in each channel."""
+    return np.asarray(cv2.merge([plane, plane, plane]), np.float32)

@@ -1,0 +1,87 @@
+"""The contracts of the functions that tell figures from ground, and of the robust plates."""
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from shadowtool.core import holdout, matting, partial_coverage
+from shadowtool.core.noise import NoiseModel
+from shadowtool.core.robust_plates import keyed
+from tests.core.contracts import (
+    TAME,
+    UNIT,
+    Contract,
+    array,
+    halfs,
+    is_kept,
+    mask,
+    picture,
+    plane,
+)
+
+MODEL = NoiseModel(np.full(3, 1e-3), np.full(3, 1e-6))
+COUNTS = st.integers(0, 40)
+
+
+def counts(h, w):
+    return array(h, w, elements=COUNTS, dtype=np.uint32)
+
+
+def completed(lit, shadow, frames):
+    # Where nothing was shaded there is no shadow.
+    shadow = np.where((frames > 0)[..., None], np.minimum(lit, shadow), np.float32(np.nan))
+    noise = np.full(lit.shape, 0.01, np.float32)
+    return partial_coverage.complete_shadow(lit, shadow, frames, noise)
+
+
+CONTRACTS = {
+    "pull_figure": Contract(
+        matting.pull_figure,
+        lambda h, w: st.tuples(picture(h, w), plane(h, w, UNIT), picture(h, w, TAME)),
+        lambda r, c, a, b: (
+            r.foreground.dtype == np.float32
+            and (r.foreground >= 0).all()
+            and (r.foreground[a == 0] == 0).all()
+            and (r.foreground[np.isnan(c)] == 0).all()
+            and np.isfinite(r.alpha).all()
+        ),
+    ),
+    "on_grid": Contract(
+        lambda a: holdout.on_grid(a, 2),
+        lambda h, w: st.tuples(halfs(h, w)),
+        lambda r, a: r.dtype == np.float32 and np.array_equal(
+            r, a[::2, ::2].astype(np.float32), equal_nan=True
+        ),
+    ),
+    "full_size": Contract(
+        lambda m: holdout.full_size(m, 2 * m.shape[1], 2 * m.shape[0], 2),
+        lambda h, w: st.tuples(mask(h, w)),
+        lambda r, m: (
+            r.shape == (2 * m.shape[0], 2 * m.shape[1])
+            and set(np.unique(r).tolist()) <= {0, 255}
+            and (r[::2, ::2][m] == 255).all()
+        ),
+    ),
+    "keyed": Contract(
+        lambda a, m: keyed(a, m),
+        lambda h, w: st.tuples(halfs(h, w), plane(h, w, UNIT)),
+        lambda r, a, m: (
+            r.keys.shape == a.shape
+            and r.gray.shape == m.shape
+            and np.array_equal(r.seen, np.isfinite(a).all(axis=-1) & (m <= 0))
+        ),
+    ),
+    "complete_shadow": Contract(
+        completed,
+        lambda h, w: st.tuples(picture(h, w, TAME), picture(h, w, TAME), counts(h, w)),
+        lambda r, lit, shadow, frames: (
+            r.shadow.shape == lit.shape and (r.own >= 0).all() and (r.own <= 1).all()
+        ),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("name", CONTRACTS)
+def test_a_contract_is_kept(name):
+    is_kept(CONTRACTS[name])

@@ -6,6 +6,8 @@ fitted to a window that holds it, but need not be centred on it: of all such win
 plane is known best, among those that the measurements agree with.
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +16,9 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-# Half the windows' widths, pixels, for edges that move up to 12 pixels a frame.
-RADII = (1, 2, 4, 7)
+# Half the windows' widths, pixels, for edges that move up to so many pixels a frame; and the
+# largest for any.
+RADII, _STEP, _WIDEST = (1, 2, 4, 7), 12.0, 40
 # Mean squared deviation from its plane, in squared errors, above which a window holds more than
 # one surface.
 _MISFIT = 1.5
@@ -30,29 +33,45 @@ _LEVEL = 0.1
 _FLOOR = 0.02
 
 
-def reach(radii: tuple[int, ...] = RADII) -> int:
-    """How far from a pixel its value may depend on others, pixels."""
-    return 2 * max(radii) + 1
+@dataclass(frozen=True)
+class Windows:
+    """In what windows planes are fitted.
 
+    Attributes:
+        radii: half their widths, pixels, ascending.
+        factor: by how much a plane is known worse than from independent measurements.
+    """
 
-def radii_for(step: float) -> tuple[int, ...]:
-    """Half the windows' widths for edges that move ``step`` pixels a frame: what happens between
-    two frames is told by windows about as wide as the step."""
-    radii = list(RADII)
-    while radii[-1] < 0.6 * step and radii[-1] < 40:
-        radii.append(round(radii[-1] * 1.7))
-    return tuple(radii)
+    radii: tuple[int, ...] = RADII
+    factor: float = 1.0
+
+    @property
+    def reach(self) -> int:
+        """How far from a pixel its value may depend on others, pixels."""
+        return 2 * max(self.radii) + 1
+
+    @classmethod
+    def for_step(cls, step: float, radii: tuple[int, ...] = RADII) -> "Windows":
+        """For edges that move ``step`` pixels a frame.
+
+        What happens between two frames is told by windows about as wide as the step. In smaller
+        ones all pixels say the same, and no more than a few of them.
+
+        Args:
+            radii: for steps of up to 12 pixels.
+        """
+        factor = max(step / _STEP, 1.0)
+        return cls(tuple(min(round(radius * factor), _WIDEST) for radius in radii), factor)
 
 
 def fit_planes(
-    value: Float32, error: Float32, radii: tuple[int, ...] = RADII
+    value: Float32, error: Float32, windows: Windows = Windows()
 ) -> tuple[Float32, Float32]:
     """Each pixel's value on the best known plane that agrees with the measurements around it.
 
     Args:
         value: (H, W) float32; NaN unknown, which takes no part.
         error: (H, W) float32, standard deviation of each value, in its unit; infinite unknown.
-        radii: half the windows' widths, ascending.
 
     Returns:
         Value and predicted error, (H, W) float32 each; NaN and infinite where the value was
@@ -67,7 +86,7 @@ def fit_planes(
     own = best.copy()
     own_weight = weight.astype(np.float32)
     spread = np.where(trusted, variance, np.inf).astype(np.float32)
-    for radius in radii:
+    for radius in windows.radii:
         plane, covariance, misfit = _planes(measured, weight, radius)
         smaller, smaller_spread = best.copy(), spread.copy()
         for row, column in np.ndindex(3, 3):
@@ -76,7 +95,7 @@ def fit_planes(
             # The window's centre lies (dx, dy) ahead, so the pixel lies (-dx, -dy) off it.
             fitted = plane[0][there] - dx * plane[1][there] - dy * plane[2][there]
             certain = _variance(covariance, there, -dx, -dy)
-            certain *= np.maximum(misfit[there], 1)
+            certain *= np.maximum(misfit[there], 1) * np.float32(windows.factor**2)
             certain += _FLOOR**2
             off_own = (fitted - own[here]) ** 2 * own_weight[here]
             off_smaller = (fitted - smaller[here]) ** 2

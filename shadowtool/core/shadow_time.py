@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from shadowtool.core.bands import bands
 from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel, extreme_range
-from shadowtool.core.plane_fits import fit_planes
+from shadowtool.core.plane_fits import Windows, fit_planes
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -45,7 +45,8 @@ LEAST_CONTRAST = 2 * (1 - float(_NEARLY_LIT))
 # How many frames are kept meanwhile.
 _KEPT_BYTES, _LEAST_KEPT, _MOST_KEPT = 2**28, 6, 24
 # Half the widths of the windows in which times are taken for linear, pixels.
-_WINDOWS = (2, 5)
+_RADII = (2, 5)
+_WINDOWS = Windows(_RADII)
 # Less than this part of the usual contrast is that of a pixel in shade.
 _SHADE = 0.3
 
@@ -329,17 +330,40 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
     return time.astype(np.float32), np.where(known, error, np.inf).astype(np.float32)
 
 
-def refined_times(time: Float32, error: Float32, at: NDArray[np.int32]) -> tuple[Float32, Float32]:
+def time_windows(time: Float32, plane: Bool) -> Windows:
+    """Windows for `refined_times`: they grow with the edge's step, which is seen in the mean slope
+    of the times on the reference plane.
+
+    Args:
+        time: (H, W), positions among the frames; NaN unknown.
+        plane: (H, W), the reference plane region.
+    """
+    slopes = []
+    for axis in (0, 1):
+        slope = np.diff(time, axis=axis)
+        both = plane[1:] & plane[:-1] if axis == 0 else plane[:, 1:] & plane[:, :-1]
+        # Larger steps are from one thing to another.
+        with np.errstate(invalid="ignore"):
+            slope = slope[both & (np.abs(slope) < 2)]
+        slopes.append(float(slope.mean()) if slope.size else 0.0)
+    steepest = float(np.hypot(slopes[0], slopes[1]))
+    return Windows.for_step(1 / steepest if steepest > 0 else 0.0, _RADII)
+
+
+def refined_times(
+    time: Float32, error: Float32, at: NDArray[np.int32], windows: Windows = _WINDOWS
+) -> tuple[Float32, Float32]:
     """Times as the pixels around tell them too, each within its own interval between two frames.
 
     Args:
         time, error: (H, W) float32 from `own_times`.
         at: (H, W) from `Crossings`.
+        windows: in which times are taken for linear.
 
     Returns:
         Positions among the frames and their predicted errors; (H, W) float32 each.
     """
-    fitted, spread = fit_planes(time, error, _WINDOWS)
+    fitted, spread = fit_planes(time, error, windows)
     return np.clip(fitted, at - 1, at).astype(np.float32), spread
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.pictures import time_picture
-from shadowtool.core.plane_fits import reach
 from shadowtool.core.shadow_lines import (
     Bend,
     NoLinesError,
@@ -27,6 +26,7 @@ from shadowtool.core.shadow_time import (
     own_times,
     refined_times,
     significant,
+    time_windows,
     without_shade,
 )
 from shadowtool.core.warp_map import Pass
@@ -173,13 +173,14 @@ def _times(
     lit = without_shade(contrast, crossings.highest, np.isfinite(own), region)
     own, own_error = np.where(lit, own, np.nan), np.where(lit, own_error, np.inf)
     time, error = np.empty_like(own), np.empty_like(own_error)
+    windows = time_windows(own, region)
 
     def refine(band: tuple[slice, slice]) -> tuple[slice, slice, tuple[Float32, Float32]]:
         rows, inner = band
-        found = refined_times(own[rows], own_error[rows], crossings.at[rows])
+        found = refined_times(own[rows], own_error[rows], crossings.at[rows], windows)
         return rows, inner, found
 
-    for rows, inner, found in ordered_map(refine, overlapping_bands(len(own), reach()), jobs):
+    for rows, inner, found in ordered_map(refine, overlapping_bands(len(own), windows.reach), jobs):
         for whole, part in zip((time, error), found, strict=True):
             whole[rows][inner] = part[inner]
     # From positions among the frames to frame numbers, which may be further apart.

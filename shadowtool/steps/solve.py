@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.epipole import Epipole, find_epipole
 from shadowtool.core.parallax import measure_parallax
-from shadowtool.core.plane_fits import fit_planes, radii_for, reach
+from shadowtool.core.plane_fits import Windows, fit_planes
 from shadowtool.core.shadow_lines import line_speed
 from shadowtool.core.warp_map import Pass, WarpMap, identity_map, intersect
 from shadowtool.parallel import ordered_map
@@ -41,7 +41,7 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     height, width = passes[0].times.time.shape
     positions = identity_map(height, width)
     speeds = [line_speed(scan.lines, (height, width)) for scan in passes]
-    radii = radii_for(max(float(np.median(speed)) for speed in speeds))
+    windows = Windows.for_step(max(float(np.median(speed)) for speed in speeds))
     every = max(1, math.isqrt(height * width // _THIN))
     thin = slice(None, None, every)
     found = intersect([scan.part(thin, thin) for scan in passes], speeds)
@@ -52,14 +52,14 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
         own = [scan.part(rows) for scan in passes]
         here = positions[rows]
         if epipole is None:
-            part = _in_two_dimensions(own, here, speeds, radii)
+            part = _in_two_dimensions(own, here, speeds, windows)
         else:
-            part = _towards(epipole, own, here, speeds, radii)
+            part = _towards(epipole, own, here, speeds, windows)
         own_rows = slice(rows.start + inner.start, rows.start + inner.stop)
         return own_rows, WarpMap(part.warp[inner], part.error[inner])
 
     whole = WarpMap(np.empty((height, width, 2), np.float32), np.empty((height, width), np.float32))
-    cuts = overlapping_bands(height, reach(radii))
+    cuts = overlapping_bands(height, windows.reach)
     progress(0, len(cuts))
     for done, (rows, part) in enumerate(ordered_map(band, cuts, jobs), start=1):
         whole.warp[rows], whole.error[rows] = part.warp, part.error
@@ -72,11 +72,11 @@ def _towards(
     passes: list[Pass],
     positions: Float32,
     speeds: list[NDArray[np.float64]],
-    radii: tuple[int, ...],
+    windows: Windows,
 ) -> WarpMap:
     directions = epipole.directions(positions)
     shift, error = measure_parallax(passes, positions, directions, speeds)
-    shift, error = fit_planes(shift, error, radii)
+    shift, error = fit_planes(shift, error, windows)
     return WarpMap(positions + shift[..., None] * directions, error)
 
 
@@ -84,12 +84,12 @@ def _in_two_dimensions(
     passes: list[Pass],
     positions: Float32,
     speeds: list[NDArray[np.float64]],
-    radii: tuple[int, ...],
+    windows: Windows,
 ) -> WarpMap:
     found = intersect(passes, speeds)
     displacement = found.warp - positions
     # The predicted error is that of both coordinates together.
     each = (found.error / np.sqrt(2)).astype(np.float32)
-    x, y = (fit_planes(displacement[..., axis], each, radii) for axis in (0, 1))
+    x, y = (fit_planes(displacement[..., axis], each, windows) for axis in (0, 1))
     warp = positions + np.stack([x[0], y[0]], axis=-1)
     return WarpMap(warp, np.hypot(x[1], y[1]).astype(np.float32))

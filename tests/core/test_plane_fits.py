@@ -3,8 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowtool.core.plane_fits import RADII, fit_planes, radii_for, reach
+from shadowtool.core.plane_fits import RADII, Windows, fit_planes
 
+REACH = Windows().reach
 ROWS, COLUMNS = np.mgrid[:60, :80].astype(np.float64)
 
 
@@ -33,7 +34,7 @@ def by_hand(
 def test_a_single_centred_window_is_plain_least_squares() -> None:
     value, error = measured(0.02 * COLUMNS, 0.3)
     error *= np.random.default_rng(1).uniform(0.8, 1.2, error.shape).astype(np.float32)
-    fitted, spread = fit_planes(value, error, (3,))
+    fitted, spread = fit_planes(value, error, Windows((3,)))
     for row, column in ((0, 0), (30, 40), (41, 17)):
         # Of a window's pixels the middle is known best: elsewhere the window is shifted.
         inside = (slice(row, row + 1), slice(column, column + 1))
@@ -97,15 +98,27 @@ def test_bands_of_the_picture_give_the_same() -> None:
     value, error = measured(np.hypot(ROWS, COLUMNS), 0.5)
     whole, spread = fit_planes(value, error)
     first = 30
-    part, part_spread = fit_planes(value[first - reach() :], error[first - reach() :])
-    assert np.array_equal(part[reach() :], whole[first:])
-    assert np.array_equal(part_spread[reach() :], spread[first:])
+    part, part_spread = fit_planes(value[first - REACH :], error[first - REACH :])
+    assert np.array_equal(part[REACH:], whole[first:])
+    assert np.array_equal(part_spread[REACH:], spread[first:])
 
 
 def test_windows_grow_with_the_step() -> None:
-    assert radii_for(10) == RADII
-    assert radii_for(40)[: len(RADII)] == RADII and 20 < radii_for(40)[-1] < 45
-    assert radii_for(1e6)[-1] < 80
+    assert Windows.for_step(10) == Windows()
+    assert Windows.for_step(36) == Windows(tuple(3 * radius for radius in RADII), 3.0)
+    assert Windows.for_step(1e6).reach < 200
+
+
+def test_between_frames_far_apart_the_few_that_were_caught_lead() -> None:
+    # 40 pixels a frame: small windows hold nothing but pixels of one and the same interval.
+    rows, columns = np.mgrid[:160, :200]
+    truth = columns / 40 + rows / 160
+    caught = np.random.default_rng(0).uniform(size=truth.shape) < 0.03
+    value = np.where(caught, truth, np.floor(truth) + 0.5).astype(np.float32)
+    error = np.where(caught, 0.01, 12**-0.5).astype(np.float32)
+    fitted, _ = fit_planes(value, error, Windows.for_step(40))
+    assert np.median(np.abs(fitted - truth)) < 0.02
+    assert np.percentile(np.abs(fitted - truth), 90) < 0.05
 
 
 @settings(max_examples=30, deadline=None)

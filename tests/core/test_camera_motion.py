@@ -38,3 +38,20 @@ def test_a_shadow_that_moves_is_not_the_camera() -> None:
 def test_a_picture_without_texture_tells_nothing() -> None:
     blank = np.full((100, 100), 0.5, np.float32)
     assert shift(prepare(blank), prepare(blank), 100) is None
+
+
+def test_grain_that_shows_one_direction_only_is_no_movement() -> None:
+    rng = np.random.default_rng(3)
+    rows = np.repeat(rng.uniform(0.2, 0.6, (120, 1)), 200, axis=1)
+    grain = cv2.GaussianBlur(rows, (0, 0), 1.5)
+    # A little else along the grain, drowned in the noise of each frame.
+    grain = grain + cv2.GaussianBlur(rng.normal(scale=0.05, size=grain.shape), (0, 0), 2.0)
+    frames = [
+        (grain + cv2.GaussianBlur(rng.normal(scale=0.08, size=grain.shape), (0, 0), 1.5)).astype(
+            "f4"
+        )
+        for _ in range(8)
+    ]
+    first = prepare(frames[0])
+    found = [shift(first, prepare(frame), 200) for frame in frames[1:]]
+    assert max(value for value in found if value is not None) < 0.3

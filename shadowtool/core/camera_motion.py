@@ -39,7 +39,7 @@ def shift(reference: Float32, other: Float32, width: int) -> float | None:
     The median over a grid of tiles, so that what moves in the scene is outvoted; each tile by
     maximising the enhanced correlation coefficient (Evangelidis and Psarakis 2008). A camera moves
     all tiles alike; of what they disagree in, as where the grain of wood shows one direction only,
-    twice the median's standard error is taken off.
+    three standard errors of the median are taken off.
 
     Args:
         reference, other: from `prepare`, of one size.
@@ -57,7 +57,7 @@ def shift(reference: Float32, other: Float32, width: int) -> float | None:
         return None
     middle = np.median(shifts, axis=0)
     error = _MEDIAN_ERROR * np.median(np.abs(shifts - middle), axis=0) / np.sqrt(len(shifts))
-    x, y = np.maximum(np.abs(middle) - 2 * error, 0)
+    x, y = np.maximum(np.abs(middle) - 3 * error, 0)
     return float(np.hypot(x, y) * width / reference.shape[1])
 
 

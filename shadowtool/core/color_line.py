@@ -4,6 +4,8 @@ What the camera sees of the background lies on the line from S to L through each
 than lit or darker than shadow is off it, and so is another hue.
 """
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,28 +43,34 @@ def line_distance(
 
 
 def channels(image: NDArray[np.floating]) -> Float32:
-    """An image (..., 3) as three planes, (3, ...) float32."""
-    return np.ascontiguousarray(np.moveaxis(image, -1, 0), np.float32)
+    """The colours of an image (..., 3) by channel, (3, N) float32."""
+    return np.ascontiguousarray(image.reshape(-1, 3).T, np.float32)
 
 
 class Weighed:
     """Colours that are held against one line after the other."""
 
     def __init__(self, colours: Float32, noise: NoiseModel, tolerance: float) -> None:
-        """Args: as `line_distance`, but ``colours`` is (3, ...)."""
-        each = (3,) + (1,) * (colours.ndim - 1)
+        """Args: as `line_distance`, but ``colours`` is (3, N)."""
         with np.errstate(invalid="ignore", over="ignore"):
             value = np.maximum(colours, 0)
-            sigma = value * noise.slope.astype(np.float32).reshape(each)
-            sigma += noise.floor.astype(np.float32).reshape(each)
+            sigma = value * noise.slope.astype(np.float32)[:, None]
+            sigma += noise.floor.astype(np.float32)[:, None]
             np.sqrt(sigma, out=sigma)
             value *= np.float32(tolerance)
             sigma += value
             self._weight = 1 / np.maximum(sigma, np.float32(1e-6), out=sigma)
         self._colours = colours
 
+    def take(self, where: NDArray[np.intp]) -> "Weighed":
+        """Some of the colours."""
+        part = copy(self)
+        part._colours = self._colours.take(where, axis=1)
+        part._weight = self._weight.take(where, axis=1)
+        return part
+
     def line_distance(self, lit: Float32, shadow: Float32) -> Float32:
-        """`line_distance` from S and L, (3, ...) each."""
+        """`line_distance` from S and L, (3, N) each, to (N,)."""
         with np.errstate(invalid="ignore", over="ignore"):
             direction = lit - shadow
             direction *= self._weight
@@ -80,4 +88,4 @@ class Weighed:
 
 
 def _dot(one: Float32, other: Float32) -> Float32:
-    return np.asarray(np.einsum("c...,c...->...", one, other))
+    return np.asarray(np.einsum("cn,cn->n", one, other))

@@ -17,6 +17,8 @@ _LARGEST_HOLE = 0.005
 # Below this many standard deviations between L and S, β would be off by more than 0.1.
 _LEAST_CONTRAST = 10.0
 _WINDOW = 5
+# So many rows at a time stay in the processor's cache.
+_ROWS = 16
 # Half the contrast's reciprocal more noise in full light, and so many deviations to be sure.
 _LIT_NOISE, _SURE = 0.7, 3.0
 
@@ -74,14 +76,19 @@ def shadow_contrast(plates: Plates, noise: NoiseModel) -> Float32:
     Returns:
         (H, W) float32 ≥ 0; NaN where a plate is.
     """
-    span = plates.lit - plates.shadow
-    sigma = noise.sigma((plates.lit + plates.shadow) / 2)
-    length2 = (span**2).sum(axis=-1)
-    projected = np.sqrt((span**2 * sigma**2).sum(axis=-1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        contrast = length2 / projected
-    contrast[length2 == 0] = 0
-    return np.asarray(contrast, np.float32)
+    contrast = np.empty(plates.lit.shape[:2], np.float32)
+    for start in range(0, len(contrast), _ROWS):
+        rows = slice(start, start + _ROWS)
+        lit, shadow = plates.lit[rows], plates.shadow[rows]
+        span = lit - shadow
+        sigma = noise.sigma((lit + shadow) / 2)
+        length2 = np.einsum("...c,...c->...", span, span)
+        sigma *= span
+        projected = np.sqrt(np.einsum("...c,...c->...", sigma, sigma))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            contrast[rows] = length2 / projected
+        contrast[rows][length2 == 0] = 0
+    return contrast
 
 
 def unknown_beta(contrast: Float32, frames: NDArray[np.uint32] | None) -> Bool:

@@ -347,8 +347,7 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         estimate.add(item.keyed)
     assert estimate is not None
     found = estimate.measured()
-    sigma = noise.sigma(np.nan_to_num(found.shadow))
-    completed = complete_shadow(found.lit, found.shadow, found.shadow_frames, sigma, region)
+    completed = complete_shadow(found.lit, found.shadow, found.shadow_frames, noise, region)
     plates = Plates(found.lit, completed.shadow, found.lit_frames, found.shadow_frames)
     seen = found.lit_frames > 0
     figures: Figures = {

@@ -4,12 +4,17 @@ What the camera sees of the background lies on the line from S to L through each
 than lit or darker than shadow is off it, and so is another hue.
 """
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
+
+# So many pixels at a time stay in the processor's cache.
+_BLOCK = 1 << 15
 
 
 def line_distance(
@@ -27,13 +32,60 @@ def line_distance(
     Returns:
         (...) float32 ≥ 0; 0 where anything is unknown.
     """
-    with np.errstate(invalid="ignore", over="ignore"):
-        sigma = noise.sigma(image) + np.float32(tolerance) * np.maximum(image, 0)
-        weight = 1 / np.maximum(sigma, np.float32(1e-6))
-        direction = (lit - shadow) * weight
-        above = (image - shadow) * weight
-        length = np.maximum((direction**2).sum(axis=-1), np.float32(1e-9))
-        part = np.clip((above * direction).sum(axis=-1) / length, 0, 1)
-        rest = above - part[..., None] * direction
-        distance = np.sqrt((rest**2).sum(axis=-1))
-    return np.asarray(np.nan_to_num(distance, nan=0.0, posinf=1e6), np.float32)
+    arrays = np.broadcast_arrays(image, lit, shadow)
+    pixels = [values.reshape(-1, 3) for values in arrays]
+    flat = np.empty(len(pixels[0]), np.float32)
+    for start in range(0, flat.size, _BLOCK):
+        part = slice(start, start + _BLOCK)
+        colours, light, shade = (channels(values[part]) for values in pixels)
+        flat[part] = Weighed(colours, noise, tolerance).line_distance(light, shade)
+    return flat.reshape(arrays[0].shape[:-1])
+
+
+def channels(image: NDArray[np.floating]) -> Float32:
+    """The colours of an image (..., 3) by channel, (3, N) float32."""
+    return np.ascontiguousarray(image.reshape(-1, 3).T, np.float32)
+
+
+class Weighed:
+    """Colours that are held against one line after the other."""
+
+    def __init__(self, colours: Float32, noise: NoiseModel, tolerance: float) -> None:
+        """Args: as `line_distance`, but ``colours`` is (3, N)."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            value = np.maximum(colours, 0)
+            sigma = value * noise.slope.astype(np.float32)[:, None]
+            sigma += noise.floor.astype(np.float32)[:, None]
+            np.sqrt(sigma, out=sigma)
+            value *= np.float32(tolerance)
+            sigma += value
+            self._weight = 1 / np.maximum(sigma, np.float32(1e-6), out=sigma)
+        self._colours = colours
+
+    def take(self, where: NDArray[np.intp]) -> "Weighed":
+        """Some of the colours."""
+        part = copy(self)
+        part._colours = self._colours.take(where, axis=1)
+        part._weight = self._weight.take(where, axis=1)
+        return part
+
+    def line_distance(self, lit: Float32, shadow: Float32) -> Float32:
+        """`line_distance` from S and L, (3, N) each, to (N,)."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            direction = lit - shadow
+            direction *= self._weight
+            rest = self._colours - shadow
+            rest *= self._weight
+            part = _dot(rest, direction)
+            part /= np.maximum(_dot(direction, direction), np.float32(1e-9))
+            np.clip(part, 0, 1, out=part)
+            direction *= part
+            rest -= direction
+            distance = np.sqrt(_dot(rest, rest))
+        # Of NaN and a number fmax takes the number.
+        np.fmax(distance, 0, out=distance)
+        return np.asarray(np.minimum(distance, 1e6, out=distance), np.float32)
+
+
+def _dot(one: Float32, other: Float32) -> Float32:
+    return np.asarray(np.einsum("cn,cn->n", one, other))

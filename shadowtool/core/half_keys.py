@@ -15,6 +15,7 @@ Float32 = NDArray[np.float32]
 
 # Below this exponent halfs are evenly spaced.
 _LEAST_EXPONENT = -14
+_SIGN = np.int16(-0x8000)
 
 
 def to_keys(halfs: NDArray[np.float16]) -> Int16:
@@ -70,13 +71,12 @@ def keys_per_unit(values: NDArray[np.floating]) -> Float32:
 
 
 def gray_keys(keys: Int16) -> Int16:
-    """One key a pixel, (H, W), of the keys of its three channels (H, W, 3)."""
-    red, gray, blue = (np.asarray(plane, np.int16) for plane in cv2.split(keys))
-    for plane, shift in ((red, 2), (gray, 1), (blue, 2)):
-        np.right_shift(plane, shift, out=plane)
-    gray += red
-    gray += blue
-    return gray
+    """One key a pixel, (H, W), of the keys of its three channels (H, W, 3): their luma."""
+    if not keys.size or keys.min() >= 0:
+        return np.asarray(cv2.cvtColor(keys.view(np.uint16), cv2.COLOR_RGB2GRAY)).view(np.int16)
+    # OpenCV knows unsigned integers only; the weights add up to 1, so an offset stays the same.
+    above = (keys ^ _SIGN).view(np.uint16)
+    return np.asarray(cv2.cvtColor(above, cv2.COLOR_RGB2GRAY)).view(np.int16) ^ _SIGN
 
 
 def not_finite(halfs: NDArray[np.float16]) -> NDArray[np.bool_] | None:

@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.color_line import line_distance
+from shadowtool.core.color_line import Weighed, channels, line_distance
 from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
+Index = NDArray[np.intp]
 
 # The grid has about this many columns; so many frames are its samples.
 _COLUMNS = 320
@@ -29,6 +30,8 @@ _ON_LINE, _TOLERANCE = 4.0, 0.01
 _MOST, _SHADED, _AT_ONCE = 0.5, 0.5, 0.2
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
+# Decided pixels are dropped when no more than this part is left.
+_WORTHWHILE = 0.75
 # A part of the scene in shade that the common ratio does not explain: so many samples at least.
 _LEAST_SHADED = 3
 # Of textured ground a figure hides the texture: its logarithm over that of L scatters by more
@@ -72,22 +75,26 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background | N
         None for a take in which a shadow comes over most of the picture: that is a card waved over
         a scene whose surfaces have each their own S/L, and nobody is in it.
     """
-    stack = np.nan_to_num(np.stack(samples), nan=0.0, posinf=1e4, neginf=0.0)
-    in_time = list(stack)
-    order = np.argsort(stack.sum(axis=-1), axis=0)
-    stack = np.take_along_axis(stack, order[..., None], axis=0)
-    ratio = _common_ratio(stack)
-    lit = _most_supported(stack, in_time, ratio, noise)
+    shape = samples[0].shape
+    stack = np.stack([channels(sample) for sample in samples])
+    stack = np.nan_to_num(stack, copy=False, nan=0.0, posinf=1e4, neginf=0.0)
+    weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
+    ascending = np.argsort(stack.sum(axis=1), axis=0)
+    ratio = _common_ratio(stack, ascending)[:, None]
+    lit = _most_supported(stack, ascending, weighed, ratio)
     shadow = lit * ratio
-    if _under_a_card(in_time, lit, shadow, noise):
+    on_line = [_on_line(sample, lit, shadow) for sample in weighed]
+    if _under_a_card(stack, on_line, lit):
         return None
-    return Background(lit, _deeper_shade(stack, lit, shadow, noise), noise)
+    shadow = _deeper_shade(stack, on_line, lit, shadow, shape[:2])
+    lit, shadow = (np.ascontiguousarray(plate.T).reshape(shape) for plate in (lit, shadow))
+    return Background(lit, shadow, noise)
 
 
 def figure_mask(image: Float32, background: Background) -> Bool:
     """Where a frame on the grid, (h, w, 3), shows something that is not the background."""
     lit, shadow, noise = background.lit, background.shadow, background.noise
-    off = (~_on_line(image, lit, shadow, noise)).astype(np.uint8)
+    off = (line_distance(image, lit, shadow, noise, _TOLERANCE) > _ON_LINE).astype(np.uint8)
     # A lone grid point may be noise; a figure is connected, and its holes are its own.
     support = cv2.boxFilter(off.astype(np.float32), -1, (3, 3))
     solid = ((off > 0) & (support > 0.4)).astype(np.uint8)
@@ -106,7 +113,8 @@ def full_size(mask: Bool, width: int, height: int, step: int) -> UInt8:
         np.minimum((np.arange(size) + step // 2) // step, points - 1)
         for size, points in zip((height, width), mask.shape, strict=True)
     )
-    return np.ascontiguousarray(mask[np.ix_(rows, columns)].astype(np.uint8) * np.uint8(255))
+    values = np.where(mask, np.uint8(255), np.uint8(0))
+    return np.asarray(values.take(columns, axis=1).take(rows, axis=0), np.uint8)
 
 
 def _disk(radius: int) -> UInt8:
@@ -114,117 +122,138 @@ def _disk(radius: int) -> UInt8:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)), np.uint8)
 
 
-def _on_line(
-    image: Float32,
-    lit: Float32,
-    shadow: Float32,
-    noise: NoiseModel,
-) -> Bool:
-    return np.asarray(line_distance(image, lit, shadow, noise, _TOLERANCE) <= _ON_LINE)
+def _on_line(sample: Weighed, lit: Float32, shadow: Float32) -> Bool:
+    return np.asarray(sample.line_distance(lit, shadow) <= _ON_LINE)
 
 
-def _common_ratio(stack: Float32) -> Float32:
+def _ranked(stack: Float32, order: Index, pixels: Index) -> Float32:
+    """The sample that each pixel has in one place of the order; (3, N)."""
+    return np.ascontiguousarray(stack[order[pixels], :, pixels].T)
+
+
+def _common_ratio(stack: Float32, ascending: Index) -> Float32:
     """S/L, (3,): the most frequent ratio below 1 between a pixel's samples and a brighter one.
 
     Shadow keeps the ground's texture, so its ratio is the same everywhere; a figure's is not.
     """
-    gray = np.log(np.maximum(stack.sum(axis=-1), 1e-4))
-    reference = gray[int(0.85 * (len(gray) - 1))]
-    difference = (gray - reference).ravel()
-    dark = (difference > -4) & (difference < -0.25)
-    if dark.sum() < 20:
+    everywhere = np.arange(stack.shape[2])
+    bright = _ranked(stack, ascending[int(0.85 * (len(stack) - 1))], everywhere)
+    gray = np.log(np.maximum(stack.sum(axis=1), 1e-4))
+    difference = gray - np.log(np.maximum(bright.sum(axis=0), 1e-4))
+    dark = difference[(difference > -4) & (difference < -0.25)]
+    if dark.size < 20:
         return np.full(3, 0.25, np.float32)
-    counts, edges = np.histogram(difference[dark], bins=150, range=(-4, -0.25))
+    counts, edges = np.histogram(dark, bins=150, range=(-4, -0.25))
     smooth = np.convolve(counts, np.hanning(11), mode="same")
     peak = int(np.argmax(smooth))
     centre = (edges[peak] + edges[peak + 1]) / 2
-    members = (np.abs(gray - reference - centre) < 0.1).ravel()
-    top = stack[int(0.85 * (len(stack) - 1))]
-    ratios = (stack / np.maximum(top, 1e-4)).reshape(-1, 3)[members]
+    time, pixel = np.nonzero(np.abs(difference - centre) < 0.1)
+    ratios = stack[time, :, pixel] / np.maximum(bright[:, pixel].T, 1e-4)
     return np.asarray(np.clip(np.median(ratios, axis=0), 0.01, 0.9), np.float32)
 
 
 def _most_supported(
-    stack: Float32, in_time: list[Float32], ratio: Float32, noise: NoiseModel
+    stack: Float32, ascending: Index, weighed: list[Weighed], ratio: Float32
 ) -> Float32:
     """For each pixel the sample on whose line, as L, most of the samples lie.
 
     That they are spread over the take counts half as much as their number: ground is seen before
     and after a figure that stops for a while.
     """
-    best = np.full(stack.shape[1:3], -1, np.float32)
-    lit = stack[-1].copy()
-    for candidate in stack[::-_EVERY]:
-        shadow = candidate * ratio
-        votes = np.zeros(best.shape, np.float32)
-        first, last = np.full(best.shape, np.inf, np.float32), np.zeros(best.shape, np.float32)
-        for time, sample in enumerate(in_time):
-            vote = _on_line(sample, candidate, shadow, noise)
-            votes += vote
-            np.minimum(first, np.float32(time), out=first, where=vote)
-            np.maximum(last, np.float32(time), out=last, where=vote)
-        score = votes + np.where(votes > 0, last - first, 0) / 2
-        better = score > best
-        best[better] = score[better]
-        lit[better] = candidate[better]
-    count = np.zeros(lit.shape[:2], np.float32)
-    total = np.zeros_like(lit)
+    lit = np.zeros(stack.shape[1:], np.float32)
+    best = np.full(stack.shape[2], -1, np.float32)
+    most = len(stack) + (len(stack) - 1) / 2
+    pixels, remaining = np.arange(best.size), weighed
+    for order in ascending[::-_EVERY]:
+        # Where all the samples agree already nothing can be better.
+        undecided = best[pixels] < most
+        if undecided.sum() < _WORTHWHILE * undecided.size:
+            pixels = pixels[undecided]
+            remaining = [sample.take(np.flatnonzero(undecided)) for sample in remaining]
+        candidate = _ranked(stack, order, pixels)
+        score = _support(remaining, candidate, candidate * ratio)
+        better = score > best[pixels]
+        best[pixels[better]] = score[better]
+        lit[:, pixels[better]] = candidate[:, better]
     # The mean of the samples that agree with it is less noisy than the sample.
-    for sample in stack:
-        near = _on_line(sample, lit, lit * np.float32(0.97), noise)
-        total += np.where(near[..., None], sample, np.float32(0))
-        count += near
-    mean = total / np.maximum(count, 1)[..., None]
-    return np.asarray(np.where(count[..., None] > 0, mean, lit), np.float32)
+    near = [_on_line(sample, lit, lit * np.float32(0.97)) for sample in weighed]
+    mean, count = _mean_where(stack, near)
+    return np.where(count > 0, mean, lit)
 
 
-def _under_a_card(in_time: list[Float32], lit: Float32, shadow: Float32, noise: NoiseModel) -> bool:
+def _support(samples: list[Weighed], lit: Float32, shadow: Float32) -> Float32:
+    """How many samples lie on each pixel's line, and half the time between first and last."""
+    end = np.float32(len(samples))
+    votes, first, last = (np.zeros(lit.shape[1], np.float32) for _ in range(3))
+    for time, sample in enumerate(samples):
+        vote = _on_line(sample, lit, shadow).astype(np.float32)
+        votes += vote
+        # How early, counted from the end, so that 0 is none for either.
+        np.maximum(first, vote * (end - np.float32(time)), out=first)
+        np.maximum(last, vote * np.float32(time), out=last)
+    return np.asarray(votes + np.maximum(first + last - end, 0) / 2, np.float32)
+
+
+def _mean_where(stack: Float32, chosen: list[Bool]) -> tuple[Float32, Float32]:
+    """Each pixel's mean over the samples in which it is chosen, (3, N), and their number."""
+    total = np.zeros(stack.shape[1:], np.float32)
+    count = np.zeros(stack.shape[2], np.float32)
+    for sample, where in zip(stack, chosen, strict=True):
+        part = where.astype(np.float32)
+        total += sample * part
+        count += part
+    return np.asarray(total / np.maximum(count, 1), np.float32), count
+
+
+def _under_a_card(stack: Float32, on_line: list[Bool], lit: Float32) -> bool:
     """Whether a shadow came over most of the picture, twice at least.
 
     It is known by the common ratio, or by darkening much of the picture at once, which dark clothes
     do not.
     """
-    dark = np.zeros(lit.shape[:2], np.int32)
+    dark = np.zeros(lit.shape[1], np.int32)
     shaded = np.zeros_like(dark)
     widest = 0.0
-    for sample in in_time:
-        now = sample.sum(axis=-1) < _SHADED * lit.sum(axis=-1)
+    for sample, lies in zip(stack, on_line, strict=True):
+        now = sample.sum(axis=0) < _SHADED * lit.sum(axis=0)
         dark += now
-        shaded += now & _on_line(sample, lit, shadow, noise)
+        shaded += now & lies
         widest = max(widest, float(now.mean()))
     if (shaded >= 2).mean() > _MOST:
         return True
     return bool((dark >= 2).mean() > _MOST and widest > _AT_ONCE)
 
 
-def _deeper_shade(stack: Float32, lit: Float32, shadow: Float32, noise: NoiseModel) -> Float32:
+def _deeper_shade(
+    stack: Float32, on_line: list[Bool], lit: Float32, shadow: Float32, size: tuple[int, int]
+) -> Float32:
     """S of surfaces that get darker than the common ratio says: steep, glossy, or near a wall.
 
     They are told from a figure by L's texture, which shade keeps and a figure hides.
     """
-    gray = stack.sum(axis=-1)
-    total, count = np.zeros_like(lit), np.zeros(lit.shape[:2], np.float32)
-    for sample, value in zip(stack, gray, strict=True):
-        off = ~_on_line(sample, lit, shadow, noise) & (value < lit.sum(axis=-1))
-        total += np.where(off[..., None], sample, np.float32(0))
-        count += off
-    mean = total / np.maximum(count, 1)[..., None]
-    ratio = np.log(np.maximum(mean.sum(axis=-1), 1e-4) / np.maximum(lit.sum(axis=-1), 1e-4))
+    light = lit.sum(axis=0)
+    off = [~lies & (s.sum(axis=0) < light) for s, lies in zip(stack, on_line, strict=True)]
+    mean, count = _mean_where(stack, off)
+    ratio = np.log(np.maximum(mean.sum(axis=0), 1e-4) / np.maximum(light, 1e-4))
     candidate = count >= _LEAST_SHADED
-    weight = cv2.boxFilter(candidate.astype(np.float32), -1, (5, 5), normalize=False)
-    values = np.where(candidate, ratio, np.float32(0)).astype(np.float32)
-    first = cv2.boxFilter(values, -1, (5, 5), normalize=False) / np.maximum(weight, 1)
-    second = cv2.boxFilter(values**2, -1, (5, 5), normalize=False) / np.maximum(weight, 1)
+    weight = _window_sum(candidate.reshape(size).astype(np.float32))
+    values = np.where(candidate, ratio, np.float32(0)).reshape(size).astype(np.float32)
+    first = _window_sum(values) / np.maximum(weight, 1)
+    second = _window_sum(values**2) / np.maximum(weight, 1)
     smooth = np.sqrt(np.maximum(second - first**2, 0)) < _TEXTURE
-    texture = _texture(lit)
     # On ground without texture nothing tells shade from a figure: the common ratio stands.
-    shaded = candidate & smooth & (texture > 1.5 * _TEXTURE) & (mean < lit).all(axis=-1)
-    return np.where(shaded[..., None], mean, shadow).astype(np.float32)
+    kept = smooth & (_texture(light.reshape(size)) > 1.5 * _TEXTURE)
+    shaded = candidate & kept.ravel() & (mean < lit).all(axis=0)
+    return np.where(shaded, mean, shadow)
 
 
-def _texture(lit: Float32) -> Float32:
-    """Local scatter of log L."""
-    gray = np.log(np.maximum(lit.sum(axis=-1), 1e-4)).astype(np.float32)
+def _window_sum(values: Float32) -> Float32:
+    return np.asarray(cv2.boxFilter(values, -1, (5, 5), normalize=False), np.float32)
+
+
+def _texture(light: Float32) -> Float32:
+    """Local scatter of log L, of L's sum over the channels."""
+    gray = np.log(np.maximum(light, 1e-4)).astype(np.float32)
     mean = cv2.boxFilter(gray, -1, (5, 5))
     scatter = cv2.boxFilter(gray**2, -1, (5, 5)) - mean**2
     return np.asarray(np.sqrt(np.maximum(scatter, 0)), np.float32)

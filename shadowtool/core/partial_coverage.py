@@ -16,14 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.filling import fill_membrane
+from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
 # Frames that a pixel's shadow value must rest on to tell what the ratio is.
 _FIRM = 3
-# The ratio is averaged on a grid of every so many pixels.
-_COARSE = 4
+# The ratio is averaged on a grid of about so many cells along the longer side, of so many pixels
+# at least.
+_CELLS, _LEAST_CELL = 120, 4
 # Log ratios further than this from the common one belong to another surface or to a penumbra.
 _COMMON = 0.45
 # The slope of log(S/L), per pixel, at which a partial shadow is as likely as a surface.
@@ -32,6 +34,8 @@ _SLOPE = 0.05
 _MOST = 0.6
 # Within this many times the materials' spread a measured ratio is the plane's.
 _ALIKE = 2.5
+# So many pixels at a time stay in the processor's cache.
+_BLOCK = 1 << 15
 # How far S/L of one plane's materials lies from their common one, as a part; at least.
 _LEAST_SPREAD = 0.03
 
@@ -49,25 +53,37 @@ def shadow_ratio_field(
     Returns:
         (H, W, 3) float32 and the spread of log ratios; None if nothing was shaded in full.
     """
-    gray = _log_ratio(lit.sum(axis=-1), shadow.sum(axis=-1))
-    firm = (frames >= _FIRM) & np.isfinite(gray)
-    if plane is not None:
-        firm &= plane
-    # What climbs is a penumbra, however long it stood there.
-    level = _opened(firm & (_slope(gray) < _SLOPE))
-    if level.sum() < 50:
+    gray = _log_ratio(_sum(lit), _sum(shadow))
+    return _ratio_field(lit, shadow, gray, _level(gray, frames), plane)
+
+
+def _level(gray: Float32, frames: NDArray[np.uint32]) -> Bool:
+    """Where a shadow fell in several frames and log(S/L) is level: what climbs is a penumbra,
+    however long it stood there."""
+    return (frames >= _FIRM) & np.isfinite(gray) & (_slope(gray) < _SLOPE)
+
+
+def _ratio_field(
+    lit: Float32, shadow: Float32, gray: Float32, level: Bool, plane: Bool | None
+) -> tuple[Float32, float] | None:
+    where = np.flatnonzero(_opened(level if plane is None else level & plane))
+    if where.size < 50:
         return None
-    common = _mode(gray[level])
-    members = level & (np.abs(gray - common) < _COMMON)
-    ratio = _log_ratio(lit, shadow)
-    field = _smooth(ratio, members)
-    members &= np.abs(gray - field.mean(axis=-1)) < _COMMON / 2
-    if members.sum() < 50:
+    own = gray.ravel().take(where)
+    member = np.abs(own - _mode(own)) < _COMMON
+    where, own = where[member], own[member]
+    ratio = _log_ratio(*(plate.reshape(-1, 3).take(where, axis=0) for plate in (lit, shadow)))
+
+    def away(field: Float32) -> Float32:
+        common = _stretched(field.mean(axis=-1), gray.shape)
+        return np.asarray(np.abs(own - common.ravel().take(where)), np.float32)
+
+    member = away(_smooth(ratio, where, gray.shape)) < _COMMON / 2
+    if member.sum() < 50:
         return None
-    field = _smooth(ratio, members)
-    scatter = np.abs(gray - field.mean(axis=-1))[members]
-    spread = max(float(np.median(scatter)) / 0.6745, _LEAST_SPREAD)
-    return np.exp(field), spread
+    field = _smooth(ratio[member], where[member], gray.shape)
+    spread = max(float(np.median(away(field)[member])) / 0.6745, _LEAST_SPREAD)
+    return _stretched(np.exp(field), gray.shape), spread
 
 
 @dataclass(frozen=True)
@@ -89,7 +105,7 @@ def complete_shadow(
     lit: Float32,
     shadow: Float32,
     frames: NDArray[np.uint32],
-    noise: Float32,
+    noise: NoiseModel,
     plane: Bool | None = None,
 ) -> Completed:
     """The shadow plate with S/L of the plane where the shadow itself says too little.
@@ -102,44 +118,52 @@ def complete_shadow(
     Args:
         lit, shadow: (H, W, 3) float32, shadow NaN where the pixel was never darkened.
         frames: (H, W), how many frames the shadow rests on.
-        noise: (H, W, 3), standard deviation of one frame's noise at ``shadow``.
+        noise: the noise of one frame.
         plane: (H, W) the region of the plane, if it is known: the second reading holds there, the
             first elsewhere.
     """
-    dark = np.asarray(np.isfinite(shadow).all(axis=-1))
-    measured = np.asarray(np.where(dark[..., None], shadow, lit), np.float32)
-    firm = frames >= _FIRM
-    seen = np.isfinite(lit).all(axis=-1)
+    seen, dark = np.isfinite(_sum(lit)), np.isfinite(_sum(shadow))
     if plane is None:
-        partial = bool((firm & seen).sum() < _MOST * max(int(seen.sum()), 1))
+        firm = (frames >= _FIRM) & seen
+        partial = bool(firm.sum() < _MOST * max(int(seen.sum()), 1))
         region = np.full(dark.shape, partial)
     else:
         partial, region = True, plane
-    found = shadow_ratio_field(lit, shadow, frames, plane)
+    gray = _log_ratio(_sum(lit), _sum(shadow))
+    level = _level(gray, frames)
+    found = _ratio_field(lit, shadow, gray, level, plane)
+    result = np.asarray(cv2.copyTo(shadow, dark.view(np.uint8), lit.copy()), np.float32)
     if found is None:
-        return Completed(measured, np.asarray(dark, np.float32), partial=False)
-    field, spread = found
-    gray = _log_ratio(lit.sum(axis=-1), shadow.sum(axis=-1))
-    excess = np.nan_to_num(gray - np.log(field.mean(axis=-1)), nan=np.inf)
-    alike = np.asarray(np.abs(excess) < _ALIKE * spread)
-    brighter, darker = excess >= _ALIKE * spread, excess <= -_ALIKE * spread
-    # On the plane only what is level over some area can be a surface of its own.
-    surface = _opened(dark & firm & (_slope(np.where(dark, gray, np.float32(0))) < _SLOPE))
+        return Completed(result, np.asarray(dark, np.float32), partial=False)
+    expected, spread = found
+    gray -= np.log(_sum(expected) / 3)
+    with np.errstate(invalid="ignore"):
+        darker, alike = gray <= -_ALIKE * spread, np.abs(gray) < _ALIKE * spread
+    expected *= lit
     own = dark.astype(np.float32)
     few = region & dark & darker
     own[few] = np.minimum(frames[few] / np.float32(_FIRM), 1)
-    own[region & brighter & ~surface] = 0
-    result = measured.copy()
+    # On the plane only what is level over some area can be a surface of its own.
+    own[region & ~(darker | alike | _opened(level))] = 0
     # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
-    both = alike & region & (own > 0)
-    expected = field[both] * lit[both]
-    precision = frames[both][:, None] / np.maximum(noise[both], 1e-6) ** 2
-    prior = 1 / np.maximum(spread * expected, 1e-6) ** 2
-    result[both] = (precision * measured[both] + prior * expected) / (precision + prior)
-    lacking = (own < 1) & (dark | region)
-    weight = own[lacking][:, None]
-    result[lacking] = weight * result[lacking] + (1 - weight) * field[lacking] * lit[lacking]
-    return Completed(result, np.asarray(own, np.float32), partial)
+    both = np.flatnonzero(alike & region & (own > 0))
+    for start in range(0, both.size, _BLOCK):
+        where = both[start : start + _BLOCK]
+        measured, ratios = (p.reshape(-1, 3).take(where, axis=0) for p in (result, expected))
+        precision = frames.reshape(-1, 1).take(where, axis=0) / noise.sigma(measured) ** 2
+        prior = 1 / np.maximum(spread * ratios, 1e-6) ** 2
+        mean = (precision * measured + prior * ratios) / (precision + prior)
+        result.reshape(-1, 3)[where] = mean
+    weight = own[few][:, None]
+    result[few] = weight * result[few] + (1 - weight) * expected[few]
+    nothing = (own == 0) & (dark | region)
+    cv2.copyTo(expected, nothing.view(np.uint8), result)
+    return Completed(result, own, partial)
+
+
+def _sum(plate: Float32) -> Float32:
+    """Of the channels, (H, W); NaN where one is."""
+    return np.asarray(cv2.transform(plate, np.ones((1, 3), np.float32)), np.float32)
 
 
 def _opened(mask: Bool) -> Bool:
@@ -158,12 +182,11 @@ def _log_ratio(lit: Float32, shadow: Float32) -> Float32:
 def _slope(gray: Float32) -> Float32:
     """Length of the gradient of a smoothed log ratio, per pixel; unknown pixels count as 0,
     which is no shadow at all."""
-    known = np.isfinite(gray)
-    smooth = cv2.medianBlur(np.where(known, gray, np.float32(0)), 5)
-    smooth = cv2.GaussianBlur(smooth, (0, 0), 1.5)
-    x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0) / 8
-    y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1) / 8
-    return np.asarray(np.hypot(x, y), np.float32)
+    smooth = cv2.medianBlur(np.nan_to_num(gray), 5)
+    smooth = cv2.GaussianBlur(smooth, (0, 0), 1.5, dst=smooth)
+    x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
+    y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
+    return np.asarray(cv2.magnitude(x, y, magnitude=x), np.float32)
 
 
 def _mode(values: Float32) -> float:
@@ -174,21 +197,35 @@ def _mode(values: Float32) -> float:
     return float((edges[peak] + edges[peak + 1]) / 2)
 
 
-def _smooth(ratio: Float32, members: Bool) -> Float32:
-    """The members' log ratios, averaged over an eighth of the picture, continued everywhere."""
-    height, width = members.shape
-    # Something this smooth needs no full resolution.
-    small = (max(width // _COARSE, 1), max(height // _COARSE, 1))
-    values = np.where(members[..., None], ratio, np.float32(0))
-    weight = cv2.resize(members.astype(np.float32), small, interpolation=cv2.INTER_AREA)
-    total = cv2.resize(values, small, interpolation=cv2.INTER_AREA)
-    sigma = max(small) / 16
-    blurred = np.asarray(cv2.GaussianBlur(weight, (0, 0), sigma), np.float32)
-    sums = np.asarray(cv2.GaussianBlur(total, (0, 0), sigma), np.float32)
-    sums = sums.reshape(*blurred.shape, 3)
-    mean = sums / np.maximum(blurred, np.float32(1e-9))[..., None]
+def _cell(shape: tuple[int, ...]) -> int:
+    """The side of a coarse cell, pixels."""
+    return max(_LEAST_CELL, round(max(shape) / _CELLS))
+
+
+def _smooth(ratio: Float32, where: NDArray[np.intp], shape: tuple[int, ...]) -> Float32:
+    """Log ratios (N, 3) at these places of a picture, averaged over an eighth of it and continued
+    everywhere; (h, w, 3), by coarse cells."""
+    cell = _cell(shape)
+    height, width = (-(-size // cell) for size in shape)
+    rows, columns = np.divmod(where, shape[1])
+    place = rows // cell * width + columns // cell
+    planes = [
+        np.bincount(place, values, height * width).reshape(height, width).astype(np.float32)
+        for values in (np.full(len(where), 1 / cell**2), *(ratio.T / np.float32(cell**2)))
+    ]
+    sigma = max(height, width) / 16
+    blurred, *sums = (
+        np.asarray(cv2.GaussianBlur(plane, (0, 0), sigma), np.float32) for plane in planes
+    )
+    mean = np.stack(sums, axis=-1) / np.maximum(blurred, np.float32(1e-9))[..., None]
     firm = blurred > min(0.02, float(blurred.max()))
     firm |= blurred >= blurred.max()
-    filled = fill_membrane(np.asarray(mean, np.float32), firm.astype(np.float32))
-    wide = cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(wide, np.float32).reshape(height, width, 3)
+    return fill_membrane(np.asarray(mean, np.float32), firm.astype(np.float32))
+
+
+def _stretched(coarse: Float32, shape: tuple[int, ...]) -> Float32:
+    """A coarse field, (h, w) or (h, w, 3), at the picture's size."""
+    cell = _cell(shape)
+    size = (coarse.shape[1] * cell, coarse.shape[0] * cell)
+    wide = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(wide[: shape[0], : shape[1]], np.float32)

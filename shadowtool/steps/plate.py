@@ -1,7 +1,7 @@
 """Lit and shadow plates from a take in which a shadow moves over the scene."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +23,15 @@ from shadowtool.core.holdout import (
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.partial_coverage import complete_shadow
 from shadowtool.core.plates import ExtremePlates, Plates
-from shadowtool.core.robust_plates import SAMPLES, Keyed, LitLevels, RobustPlates, keyed
+from shadowtool.core.robust_plates import (
+    SAMPLES,
+    Keyed,
+    LitLevels,
+    Measured,
+    RobustPlates,
+    hide,
+    keyed,
+)
 from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.files import fingerprint_file, is_file, make_folder, new_folders
 from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
@@ -47,8 +55,9 @@ logger = logging.getLogger(__name__)
 Bool = NDArray[np.bool_]
 
 HOLDOUT_FOLDER = "holdout"
-# The channels are not needed for the lit levels.
-_NO_KEYS = np.zeros((0, 0, 3), np.int16)
+# Sampled frames are kept for the second reading up to so many bytes.
+_KEPT = 192 << 20
+_NOTHING = np.zeros((0, 0, 3), np.float16)
 
 
 def plate(
@@ -120,53 +129,77 @@ def plate(
     )
     with new_folders([output]):
         if estimator == "minmax":
-            plates, noise, more = _extremes(take, frames, automatic)
+            estimate = _extremes(take, frames, automatic)
         else:
-            plates, noise, more = _robust(take, frames, automatic, region)
+            estimate = _robust(take, frames, automatic, region)
     if len(take.used) < 2:
         logger.warning("%s: one frame shows no moving shadow", footage.sequence.pattern)
-    contrast = shadow_contrast(plates, noise)
-    unseen = int(np.isnan(plates.lit).any(axis=-1).sum())
-    figures = {
-        "frames": len(take.used),
-        "held_out": take.held_out(),
-        "pixels": int(contrast.size),
-        "unseen": unseen,
-        "noise_at_mid_grey": [round(float(v), 6) for v in noise.sigma(np.full(3, 0.18))],
-        **more,
-    }
-    if unseen == contrast.size:
-        why = "no pixel is finite in any frame"
-        if take.held_out() != "nothing":
-            why = "the holdout, or NaN, leaves nothing of any frame"
-        raise InputError(f"{footage.sequence.pattern}: {why}")
+    unseen = int(np.isnan(estimate.lit).any(axis=-1).sum())
+    pixels = estimate.lit.shape[0] * estimate.lit.shape[1]
+    if unseen == pixels:
+        raise InputError(_nothing_seen(take))
     if unseen:
-        part = 100 * unseen / contrast.size
+        part = 100 * unseen / pixels
         logger.warning("%s: %d pixels (%.2f%%) were seen in no frame", output, unseen, part)
     mark = recipe.fingerprint(take.marks)
     provenance = recipe.provenance(mark)
+    figures = {
+        "frames": len(take.used),
+        "held_out": take.held_out(),
+        "pixels": pixels,
+        "unseen": unseen,
+        "noise_at_mid_grey": [round(float(v), 6) for v in estimate.noise.sigma(np.full(3, 0.18))],
+    }
+
+    def products() -> Iterator[tuple[Path, dict[str, NDArray[np.float32]]]]:
+        # Each is encoded while the next one is made.
+        lit, shadow, confidence = plate_files(output)
+        yield lit, {"RGB": estimate.lit}
+        plates, more = estimate.complete()
+        yield shadow, {"RGB": plates.shadow}
+        figures.update(more)
+        contrast = shadow_contrast(plates, estimate.noise)
+        yield confidence, plate_layers(output, plates, contrast)[confidence]
 
     def write(item: tuple[Path, dict[str, NDArray[np.float32]]]) -> None:
         write_exr(item[0], item[1], footage.header, provenance)
 
-    for _ in ordered_map(write, plate_layers(output, plates, contrast).items(), run.jobs):
+    for _ in ordered_map(write, products(), run.jobs):
         pass
     write_manifest(output, recipe, mark, figures)
     return Result("plate", output, take.used, 0, [*absent, *take.skipped], figures)
 
 
+def _nothing_seen(take: "_Take") -> str:
+    """Why there is no pixel that any frame shows."""
+    finite = (np.isfinite(take.footage.read(f)).all(axis=-1).any() for f in take.used)
+    if any(finite):
+        return f"{take.footage.sequence.pattern}: the holdout leaves nothing of any frame"
+    return (
+        f"{take.footage.sequence.pattern}: every pixel of every frame is NaN or infinite;"
+        " write the frames again"
+    )
+
+
 class _Estimate(NamedTuple):
-    plates: Plates
+    """The lit plate, the take's noise, and how to come by the rest of the plates."""
+
+    lit: NDArray[np.float32]
     noise: NoiseModel
-    figures: Figures
+    complete: Callable[[], tuple[Plates, Figures]]
 
 
 class _Shown(NamedTuple):
-    """A frame and what is to be left out of it."""
+    """A frame and what is to be left out of it.
+
+    ``keys`` is for the robust estimator alone: with no ``values`` in its last reading, with the
+    gray keys only before.
+    """
 
     values: NDArray[np.floating]
+    grid: NDArray[np.float32]
     holdout: NDArray[np.number] | None
-    keyed: Keyed | None
+    keys: Keyed | None
     marks: list[str]
     gain: float
 
@@ -179,7 +212,8 @@ class _Take:
         held: a holdout that was given.
         background: what the automatic one goes by, once it is known; None for none.
         level: whether changes of exposure are taken out.
-        reference: what exposure is measured against, on the grid; None until it is known.
+        reference: what exposure is measured against, on its grid; None until it is known.
+        kept: frames that have been read already, and their fingerprints.
         gains: of the frames that were used, where they are not 1.
         folder: where the automatic one is written.
     """
@@ -192,6 +226,7 @@ class _Take:
     provenance: dict[str, str]
     background: Background | None = None
     reference: NDArray[np.float32] | None = None
+    kept: dict[Frame, tuple[NDArray[np.floating], str]] = field(default_factory=dict)
     gains: dict[str, float] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
@@ -207,34 +242,61 @@ class _Take:
     def step(self) -> int:
         return grid_step(*self.footage.header.size)
 
-    def shown(self, frames: list[Frame], with_keys: bool, keep: bool) -> Iterator[_Shown | None]:
-        """Each frame in turn, None for those that are skipped; ``keep`` the holdouts on disk."""
+    def grid(self, values: NDArray[np.floating]) -> NDArray[np.float32]:
+        """What the automatic holdout looks at of a frame."""
+        return on_grid(values, self.step)
+
+    def gain(self, grid: NDArray[np.float32]) -> float:
+        """A frame's exposure, from its grid."""
+        if self.reference is None:
+            return 1.0
+        return frame_gain(self.sparse(grid), self.reference)
+
+    def sparse(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Exposure takes fewer pixels than a figure's outline, unless there are few."""
+        return grid if self.step == 1 else grid[::2, ::2]
+
+    def shown(self, frames: list[Frame], with_keys: bool, last: bool) -> Iterator[_Shown | None]:
+        """Each frame in turn, None for those that are skipped.
+
+        Args:
+            last: it is the last reading: holdouts are written, and no frame stays in memory.
+        """
 
         def read(frame: Frame) -> _Shown | None:
             try:
-                image = self.footage.image(frame)
-                values = image.rgb(self.footage.transfer)
-                gain = 1.0
-                if self.reference is not None:
-                    gain = frame_gain(on_grid(values, self.step), self.reference)
+                if frame in self.kept:
+                    values, mark = self.kept.pop(frame) if last else self.kept[frame]
+                else:
+                    image = self.footage.image(frame)
+                    values, mark = image.rgb(self.footage.transfer), image.fingerprint
+                grid = self.grid(values)
+                gain = self.gain(grid)
+                if gain != 1:
                     values = without_gain(values, gain)
-                marks = [image.fingerprint]
+                    grid = self.grid(values)
+                marks = [mark]
                 holdout: NDArray[np.number] | None = None
                 if self.held is not None:
                     matte = self._given(self.held.path(frame))
                     marks.append(matte.fingerprint)
                     holdout = matte.plane("A", "Y", "R")
                 elif self.background is not None:
-                    holdout = self.automatic(on_grid(values, self.step))
-                    if keep:
+                    holdout = self.automatic(grid)
+                    if last:
                         write_png(_place(self.folder, frame), holdout, self.provenance)
             except InputError:
                 if self.run.missing == "skip":
                     return None
                 raise
-            return _Shown(
-                values, holdout, keyed(values, holdout) if with_keys else None, marks, gain
-            )
+            keys = keyed(values, holdout) if with_keys else None
+            if keys is not None:
+                # What nobody asks for any more must not wait in memory.
+                if last:
+                    values = _NOTHING
+                else:
+                    keys = keys._replace(keys=_NOTHING.view(np.int16))
+            return _Shown(values, grid, holdout, keys, marks, gain)
 
         yield from ordered_map(read, frames, self.run.jobs)
 
@@ -250,7 +312,7 @@ class _Take:
         """All the frames that can be read, with their positions; what is used is recorded."""
         total = begun + len(frames)
         self.run.progress(begun, total)
-        for position, item in enumerate(self.shown(frames, with_keys, keep=True)):
+        for position, item in enumerate(self.shown(frames, with_keys, last=True)):
             if item is None:
                 self.skipped.append(frames[position])
             else:
@@ -274,55 +336,70 @@ class _Samples:
     """What a first reading of some of the frames tells: noise, background and lit levels."""
 
     noise: NoiseModel
-    levels: LitLevels
+    levels: NDArray[np.int16]
     count: int
 
 
 def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool) -> _Samples:
     """Read a few frames; find the automatic holdout's background in them if that is wanted."""
-    pairs = {position: number for number, position in sample_positions(len(frames)).items()}
-    spread = np.linspace(0, len(frames) - 1, SAMPLES).round().astype(int).tolist()
+    numbers = {position: number for number, position in sample_positions(len(frames)).items()}
     # The same frames whether the figure is found or given: what was found can be given back.
-    positions = sorted({*pairs, *spread})
+    positions = sorted({*numbers, *_spread(len(frames))})
     chosen = [frames[position] for position in positions]
+    spread = {frames[position] for position in _spread(len(frames))}
     thinned: dict[int, NDArray[np.float32]] = {}
-    grids: list[NDArray[np.float32]] = []
-    kept: list[tuple[Frame, Keyed, NDArray[np.float32]]] = []
-    for count, item in enumerate(take.shown(chosen, with_levels, keep=False)):
+    grids: dict[Frame, NDArray[np.float32]] = {}
+    grays: dict[Frame, NDArray[np.int16]] = {}
+    free = _KEPT
+    for count, item in enumerate(take.shown(chosen, with_keys=False, last=False)):
         take.run.progress(count, len(positions) + len(frames))
         if item is None:
             continue
-        if positions[count] in pairs:
-            thinned[pairs[positions[count]]] = thin(item.values)
-        grid = on_grid(item.values, take.step)
-        if positions[count] in spread:
-            grids.append(grid)
-        if item.keyed is not None:
-            kept.append((chosen[count], item.keyed._replace(keys=_NO_KEYS), grid))
+        frame, position = chosen[count], positions[count]
+        if position in numbers:
+            thinned[numbers[position]] = thin(item.values)
+        grids[frame] = item.grid
+        if item.values.nbytes <= free:
+            free -= item.values.nbytes
+            take.kept[frame] = item.values, item.marks[0]
+        elif with_levels:
+            grays[frame] = keyed(item.values, item.holdout).gray
     noise = noise_model(noise_levels(thinned))
-    uneven: list[Frame] = []
-    if take.level and grids:
-        take.reference = common_reference(grids)
-        uneven = [frame for frame, _, grid in kept if frame_gain(grid, take.reference) != 1]
-        grids = [g / np.float32(frame_gain(g, take.reference)) for g in grids]
-    if automatic and grids:
-        take.background = find_background(grids, noise)
+    apart = [frame for frame in grids if frame in spread]
+    if take.level and apart:
+        take.reference = common_reference([take.sparse(grids[frame]) for frame in apart])
+    gains = {frame: take.gain(grid) for frame, grid in grids.items()}
+    if automatic and apart:
+        level = [grids[frame] / np.float32(gains[frame]) for frame in apart]
+        take.background = find_background(level, noise)
     if take.background is not None:
         make_folder(take.folder)
-    levels = LitLevels()
-    for frame, keys, grid in kept:
-        if frame in uneven:
-            continue
-        seen = keys.seen
-        if take.background is not None:
-            free = take.automatic(grid) == 0
-            seen = free if seen is None else seen & free
-        levels.add(keys._replace(seen=seen))
-    # Those whose exposure is off are read again, now that by how much is known.
-    for item in take.shown(uneven, True, keep=False):
-        if item is not None and item.keyed is not None:
-            levels.add(item.keyed)
-    return _Samples(noise, levels, len(positions))
+    width, height = take.footage.header.size
+    levels = LitLevels(height, width)
+    if with_levels:
+        # The others, that were kept or whose exposure is off, are keyed now that all is known.
+        ready = [frame for frame in grays if gains[frame] == 1]
+        for frame in ready:
+            if take.background is not None:
+                hide(grays[frame], take.automatic(grids[frame]) > 0)
+            levels.add(grays.pop(frame))
+        others = [frame for frame in grids if frame not in ready]
+        for item in take.shown(others, with_keys=True, last=False):
+            if item is not None and item.keys is not None:
+                levels.add(item.keys.gray)
+    return _Samples(noise, levels.levels(), len(positions))
+
+
+def _spread(frames: int) -> list[int]:
+    """Positions of some two dozen frames spread over a take, among them all those by which its
+    noise is measured that are first of their pair."""
+    starts = sorted(p for number, p in sample_positions(frames).items() if number % 2 == 0)
+    if frames <= SAMPLES or len(starts) < 2:
+        return list(range(frames))
+    each = SAMPLES // (len(starts) - 1)
+    places = np.arange(each * (len(starts) - 1) + 1) / each
+    between = np.interp(places, np.arange(len(starts)), starts)
+    return sorted({*between.round().astype(int).tolist(), frames - 1})
 
 
 def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
@@ -335,32 +412,39 @@ def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
         extremes.add(item.values, item.holdout)
         if position in numbers:
             thinned[numbers[position]] = thin(item.values)
-    return _Estimate(extremes.plates(), noise_model(noise_levels(thinned)), {})
+    plates = extremes.plates()
+    return _Estimate(plates.lit, noise_model(noise_levels(thinned)), lambda: (plates, {}))
 
 
 def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | None) -> _Estimate:
     """Means of lit and shaded frames, and the plane's ratio where the shadow fell in part."""
     sampled = _sample(take, frames, automatic, with_levels=True)
     noise = sampled.noise
-    estimate: RobustPlates | None = None
+    found = _measured(take, frames, sampled)
+
+    def complete() -> tuple[Plates, Figures]:
+        completed = complete_shadow(found.lit, found.shadow, found.shadow_frames, noise, region)
+        plates = Plates(found.lit, completed.shadow, found.lit_frames, found.shadow_frames)
+        seen = found.lit_frames > 0
+        reading = "a plane that a shadow crossed" if completed.partial else "a scene under a card"
+        figures: Figures = {
+            "gains": take.gains,
+            "shaded": round(float((found.shadow_frames > 0).mean()), 4),
+            "own_evidence": round(float(completed.own[seen].mean()), 4) if seen.any() else 0.0,
+            "read_as": reading,
+        }
+        return plates, figures
+
+    return _Estimate(found.lit, noise, complete)
+
+
+def _measured(take: _Take, frames: list[Frame], sampled: _Samples) -> Measured:
+    """The second reading, of all the frames."""
+    estimate = RobustPlates(sampled.levels, sampled.noise)
     for _, item in take.all_shown(frames, with_keys=True, begun=sampled.count):
-        assert item.keyed is not None
-        if estimate is None:
-            estimate = RobustPlates(sampled.levels.levels(), noise)
-        estimate.add(item.keyed)
-    assert estimate is not None
-    found = estimate.measured()
-    sigma = noise.sigma(np.nan_to_num(found.shadow))
-    completed = complete_shadow(found.lit, found.shadow, found.shadow_frames, sigma, region)
-    plates = Plates(found.lit, completed.shadow, found.lit_frames, found.shadow_frames)
-    seen = found.lit_frames > 0
-    figures: Figures = {
-        "gains": take.gains,
-        "shaded": round(float((found.shadow_frames > 0).mean()), 4),
-        "own_evidence": round(float(completed.own[seen].mean()), 4) if seen.any() else 0.0,
-        "read_as": "a plane that a shadow crossed" if completed.partial else "a scene under a card",
-    }
-    return _Estimate(plates, noise, figures)
+        assert item.keys is not None
+        estimate.add(item.keys)
+    return estimate.measured()
 
 
 def _place(folder: Path, frame: Frame) -> Path:

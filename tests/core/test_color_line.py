@@ -88,3 +88,35 @@ def test_without_a_shadow_the_line_is_a_point() -> None:
     image = (SCENE.lit + 7 * SIGMA * along()).astype(np.float32)
     found = line_distance(image, SCENE.lit, SCENE.lit, EVEN, 0)
     assert found == pytest.approx(7, rel=0.01)
+
+
+def slow_line_distance(image: np.ndarray, lit: np.ndarray, shadow: np.ndarray) -> np.ndarray:
+    """One pixel after the other: the nearest of many points of its line, to (N,)."""
+    found = []
+    for colour, light, shade in zip(image, lit, shadow, strict=True):
+        deviation = CAMERA.sigma(colour) + 0.02 * np.maximum(colour, 0)
+        points = shade + np.linspace(0, 1, 2001)[:, None] * (light - shade)
+        found.append(np.sqrt((((points - colour) / deviation) ** 2).sum(axis=-1)).min())
+    return np.array(found)
+
+
+@given(st.integers(0, 1000))
+def test_it_is_the_distance_to_the_nearest_of_the_lines_points(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lit = rng.uniform(0.2, 1, (20, 3)).astype(np.float32)
+    shadow = lit * rng.uniform(0.05, 0.9, 3).astype(np.float32)
+    image = rng.uniform(-0.01, 1.2, (20, 3)).astype(np.float32)
+    found = line_distance(image, lit, shadow, CAMERA, 0.02)
+    assert found == pytest.approx(slow_line_distance(image, lit, shadow), rel=1e-3, abs=0.05)
+
+
+def test_a_large_picture_is_its_pixels() -> None:
+    rng = np.random.default_rng(3)
+    shape = 210, 331
+    lit = np.resize(SCENE.lit, (*shape, 3))
+    image = rng.uniform(0, 1, (*shape, 3)).astype(np.float32)
+    whole = line_distance(image, lit, 0.2 * lit, CAMERA, 0.01)
+    assert whole.shape == shape and whole.dtype == np.float32
+    for rows in (slice(0, 7), slice(95, 120), slice(200, 210)):
+        part = line_distance(image[rows], lit[rows], 0.2 * lit[rows], CAMERA, 0.01)
+        assert np.array_equal(whole[rows], part)

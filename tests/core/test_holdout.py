@@ -219,6 +219,18 @@ def test_the_same_samples_give_the_same_bits_and_are_left_alone() -> None:
     assert all(np.array_equal(sample, full[MIDDLE]) for sample, full in pairs)
 
 
+@pytest.mark.parametrize("part", [0, 1.1])
+def test_to_pass_over_decided_pixels_changes_no_bit(
+    part: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    samples = [sample[MIDDLE] for sample in shoot("pausing").samples]
+    usual = find_background(samples, NOISE)
+    monkeypatch.setattr("shadowtool.core.holdout._WORTHWHILE", part)
+    other = find_background(samples, NOISE)
+    assert usual is not None and other is not None
+    assert np.array_equal(usual.lit, other.lit) and np.array_equal(usual.shadow, other.shadow)
+
+
 def test_a_lone_pixel_is_no_figure() -> None:
     background = shoot("empty").background
     frame = SCENE.noisy(SCENE.lit, 99)

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shadowtool.core.noise import NoiseModel
 from shadowtool.core.partial_coverage import Completed, complete_shadow, shadow_ratio_field
 from tests.scene import smoothstep
 
@@ -12,6 +13,7 @@ HEIGHT, WIDTH = 90, 160
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
 RATIO = np.array([0.12, 0.15, 0.24])
 SIGMA = 0.002
+NOISE = NoiseModel(np.zeros(3), np.full(3, SIGMA**2))
 
 
 class Take(NamedTuple):
@@ -24,8 +26,7 @@ class Take(NamedTuple):
     reached: np.ndarray
 
     def completed(self, plane: np.ndarray | None = None) -> Completed:
-        noise = np.full(self.lit.shape, SIGMA, np.float32)
-        return complete_shadow(self.lit, self.measured, self.frames, noise, plane)
+        return complete_shadow(self.lit, self.measured, self.frames, NOISE, plane)
 
     def error(self, found: np.ndarray) -> np.ndarray:
         """Of S, as a part of it, (H, W)."""

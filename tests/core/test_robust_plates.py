@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shadowtool.core.half_keys import mean_of_keys
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.plates import ExtremePlates
 from shadowtool.core.robust_plates import SAMPLES, LitLevels, Measured, RobustPlates, keyed
@@ -35,9 +36,9 @@ def take() -> list[np.ndarray]:
 def measure(frames: list[np.ndarray], holdouts: Holdouts | None = None) -> Measured:
     """Both readings of a take."""
     held = holdouts or [None] * len(frames)
-    levels = LitLevels()
+    levels = LitLevels(*frames[0].shape[:2])
     for position in np.unique(np.linspace(0, len(frames) - 1, SAMPLES).round().astype(int)):
-        levels.add(keyed(frames[position], held[position]))
+        levels.add(keyed(frames[position], held[position]).gray)
     plates = RobustPlates(levels.levels(), NOISE)
     for frame, holdout in zip(frames, held, strict=True):
         plates.add(keyed(frame, holdout))
@@ -237,15 +238,77 @@ def test_two_readings_of_the_same_take_are_the_same_bits() -> None:
 
 def test_results_may_be_asked_for_along_the_way_and_written_on() -> None:
     frames = take()
-    levels = LitLevels()
+    levels = LitLevels(*SHAPE)
     for frame in frames[::2]:
-        levels.add(keyed(frame))
+        levels.add(keyed(frame).gray)
     asked, plain = (RobustPlates(levels.levels(), NOISE) for _ in range(2))
     for frame in frames:
         asked.add(keyed(frame))
         asked.measured().lit[:] = 7
         plain.add(keyed(frame))
     assert same(asked.measured(), plain.measured())
+
+
+class SlowGroup:
+    """A group of frames of one pixel."""
+
+    def __init__(self, gray: int, keys: np.ndarray) -> None:
+        self.grays, self.keys = [gray], [keys]
+
+    def above(self, gray: int) -> float:
+        return gray - float(np.mean(self.grays))
+
+
+def slow_darkest(grays: list[int], keys: list[np.ndarray], width: float) -> SlowGroup | None:
+    """The darkest group of a pixel's darkened frames, or the next one if it is much larger."""
+    lowest = backup = None
+    for gray, key in zip(grays, keys, strict=True):
+        if lowest is None or lowest.above(gray) < -width:
+            lowest, backup = SlowGroup(gray, key), lowest
+        elif lowest.above(gray) <= width:
+            lowest.grays.append(gray)
+            lowest.keys.append(key)
+        elif backup is None or backup.above(gray) < -width:
+            backup = SlowGroup(gray, key)
+        elif backup.above(gray) <= width:
+            backup.grays.append(gray)
+            backup.keys.append(key)
+    if lowest and backup and len(lowest.grays) < 3 and len(backup.grays) >= 2 * len(lowest.grays):
+        return backup
+    return lowest
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 999))
+def test_groups_are_those_of_each_pixel_by_itself(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    height, width = 70, 3
+    # Three depths of shade, and some light.
+    depth = rng.choice([0.1, 0.25, 0.4, 1], (24, height, width, 1), p=[0.1, 0.5, 0.2, 0.2])
+    ground = rng.uniform(0.2, 0.9, (height, width, 3))
+    frames = [
+        keyed(SCENE.noisy(ground * d, seed + i).astype(np.float16)) for i, d in enumerate(depth)
+    ]
+    levels = LitLevels(height, width)
+    levels.add(keyed(SCENE.noisy(ground, 1).astype(np.float16)).gray)
+    plates = RobustPlates(levels.levels(), NOISE)
+    for frame in frames:
+        plates.add(frame)
+    found = plates.measured()
+    for y in range(height):
+        for x in range(width):
+            dark = [f for f in frames if f.gray[y, x] < plates._dark[y, x]]
+            group = slow_darkest(
+                [int(f.gray[y, x]) for f in dark],
+                [f.keys[y, x].astype(np.int32) for f in dark],
+                plates._width.reshape(height, width)[y, x],
+            )
+            if group is None:
+                assert found.shadow_frames[y, x] == 0
+                continue
+            assert found.shadow_frames[y, x] == len(group.keys)
+            mean = mean_of_keys(np.sum(group.keys, axis=0), np.array(len(group.keys)))
+            assert np.array_equal(found.shadow[y, x], mean)
 
 
 def peak(add: Callable[[], None], frames: int) -> int:
@@ -257,12 +320,12 @@ def peak(add: Callable[[], None], frames: int) -> int:
 
 def test_memory_does_not_grow_with_the_frames() -> None:
     lit, shaded = keyed(SCENE.lit), keyed(SCENE.shadow)
-    levels = LitLevels()
-    levels.add(lit)
+    levels = LitLevels(*SHAPE)
+    levels.add(lit.gray)
     plates = RobustPlates(levels.levels(), NOISE)
 
     def add() -> None:
-        levels.add(lit)
+        levels.add(lit.gray)
         plates.add(lit)
         plates.add(shaded)
 

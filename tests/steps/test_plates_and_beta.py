@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
+from shadowtool.choices import Estimator
 from shadowtool.core.beta import shadow_matte
 from shadowtool.core.plates import ExtremePlates, Plates
-from shadowtool.io.image import Header, read_image, write_exr, write_png
+from shadowtool.errors import InputError
+from shadowtool.io.image import Header, Image, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, read_plates
 from shadowtool.steps.composite import composite
 from shadowtool.steps.matte import matte
@@ -180,6 +182,53 @@ def test_the_number_of_threads_changes_no_bit(
 ) -> None:
     plate(takes / "walk", tmp_path / "plates", run=Run(jobs=1))
     assert tree(tmp_path / "plates") == tree(walk_plates)
+
+
+@pytest.mark.parametrize("budget", [0, 3 * HEIGHT * WIDTH * 6])
+def test_what_is_kept_in_memory_changes_no_bit(
+    budget: int,
+    takes: Path,
+    walk_plates: Path,
+    level_plates: Path,
+    tmp_path: Path,
+    tree,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("shadowtool.steps.plate._KEPT", budget)
+    plate(takes / "walk", tmp_path / "walk")
+    assert tree(tmp_path / "walk") == tree(walk_plates)
+    plate(takes / "dip", tmp_path / "dip", holdout="none")
+    assert tree(tmp_path / "dip") == tree(level_plates / "dip")
+
+
+def test_sampled_frames_are_read_once_as_far_as_they_are_kept(
+    takes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = []
+
+    def counting(path: Path) -> Image:
+        read.append(path)
+        return read_image(path)
+
+    monkeypatch.setattr("shadowtool.steps.footage.read_image", counting)
+    plate(takes / "walk", tmp_path / "kept")
+    assert sorted(read) == sorted((takes / "walk").iterdir())
+
+
+@pytest.mark.parametrize("estimator", ["robust", "minmax"])
+@pytest.mark.parametrize("holdout", ["none", "auto", "given"])
+def test_a_take_without_a_pixel_is_refused_for_what_it_is(
+    estimator: Estimator, holdout: str, takes: Path, tmp_path: Path
+) -> None:
+    nothing = np.full((HEIGHT, WIDTH, 3), np.nan, np.float16)
+    hollow = write_frames(tmp_path / "hollow", [nothing] * 4)
+    if holdout == "given":
+        holdout = str(write_mattes(tmp_path / "roto", [np.ones((HEIGHT, WIDTH))] * 4))
+        shown = write_frames(tmp_path / "shown", [picture(FIRST + i) for i in range(4)])
+        with pytest.raises(InputError, match="the holdout leaves nothing"):
+            plate(shown, tmp_path / "plates", holdout=holdout, estimator=estimator)
+    with pytest.raises(InputError, match="every pixel of every frame is NaN or infinite"):
+        plate(hollow, tmp_path / "plates", holdout=holdout, estimator=estimator)
 
 
 def test_a_dip_in_exposure_changes_next_to_nothing(

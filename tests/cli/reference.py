@@ -17,7 +17,8 @@ BLOCK = re.compile(r"(<!-- reference -->\n).*?(<!-- end of reference -->)", re.D
 def help_text(*words: str) -> str:
     """What ``shadowtool WORDS --help`` prints, at a fixed width."""
     command: click.Command | None = shadowtool
-    context = click.Context(shadowtool, info_name="shadowtool", terminal_width=96)
+    settings = shadowtool.context_settings
+    context = click.Context(shadowtool, info_name="shadowtool", terminal_width=96, **settings)
     for word in words:
         assert isinstance(command, click.Group)
         command = command.get_command(context, word)

@@ -152,7 +152,8 @@ class Soak:
         _, said = process.communicate(timeout=120)
         code = process.returncode
         # Until Python is up, signals are its own affair; after the last act they change nothing.
-        if output.exists() and (code not in (0, SIGNALS[fault.number]) or b"Traceback" in said):
+        early = not output.exists() or code == -fault.number or b"KeyboardInterrupt" in said
+        if not early and (code not in (0, SIGNALS[fault.number]) or b"Traceback" in said):
             raise LostError(f"{fault}: exit code {code}: {said.decode()}")
         if fault.number != signal.SIGKILL and list(output.rglob(HIDDEN)):
             raise LostError(f"{fault}: left {list(output.rglob(HIDDEN))}")

@@ -3,6 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
+from shadowtool.core.half_floats import rounded, to_float
+
 Float32 = NDArray[np.float32]
 
 # Logarithms of gains further from 0 are shadow, not exposure.
@@ -64,5 +67,9 @@ def without_gain(image: NDArray[np.floating], gain: float) -> NDArray[np.floatin
     """The frame as it would be at gain 1; the very same array if it is."""
     if gain == 1:
         return image
-    corrected = image.astype(np.float32) * np.float32(1 / gain)
-    return corrected.astype(np.float16) if image.dtype == np.float16 else corrected
+    if image.dtype != np.float16:
+        return image.astype(np.float32) * np.float32(1 / gain)
+    corrected = np.empty_like(image)
+    for rows in bands(image.shape):
+        corrected[rows] = rounded(to_float(image[rows]) * np.float32(1 / gain))
+    return corrected

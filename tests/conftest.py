@@ -8,9 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from shadowtool.cli.process import run_command
 from shadowtool.io.image import Header, write_exr, write_png
+
+# How long an example takes says more of what else the machine does than of the code.
+settings.register_profile("shared", deadline=None)
+settings.load_profile("shared")
 
 WIDTH, HEIGHT = 48, 32
 PLANE = "0,0 47,0 47,31 0,31"

@@ -20,6 +20,8 @@ from shadowtool.errors import ShadowtoolError
 INTERRUPTED, TERMINATED = 130, 143
 # A message longer than this is one with an absurd path in it.
 _LONGEST = 1000
+# Seconds after which a signal that was lost is acted on again.
+_AGAIN = 0.5
 
 
 class _Terminated(BaseException):
@@ -33,6 +35,7 @@ class _Interrupted(BaseException):
 def run_process() -> NoReturn:
     """Run the command line of this process and end it with its exit code."""
     try:
+        sys.unraisablehook = _unraisable
         signal.signal(signal.SIGTERM, _terminate)
         # A shell starts background jobs with SIGINT ignored; that is to stay so.
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
@@ -44,8 +47,10 @@ def run_process() -> NoReturn:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, signal.SIG_IGN)
     except _Terminated:
+        _arrived()
         code = TERMINATED
     except _Interrupted:
+        _arrived()
         code = INTERRUPTED
     with contextlib.suppress(OSError):
         sys.stdout.flush()
@@ -67,9 +72,11 @@ def run_command(arguments: Sequence[str]) -> int:
         _say(str(error))
         return error.exit_code
     except (KeyboardInterrupt, click.Abort, _Interrupted):
+        _arrived()
         _say("interrupted; finished frames are whole, --resume goes on from here")
         return INTERRUPTED
     except _Terminated:
+        _arrived()
         _say("terminated; finished frames are whole, --resume goes on from here")
         return TERMINATED
     except BrokenPipeError:
@@ -103,11 +110,41 @@ def _say(message: str) -> None:
 
 
 def _terminate(number: int, frame: FrameType | None) -> NoReturn:
-    raise _Terminated
+    _stop(_Terminated)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    raise _Interrupted
+    _stop(_Interrupted)
+
+
+def _stop(kind: type[BaseException]) -> NoReturn:
+    """Raise, and again after a while if it did not get through.
+
+    Python drops what is raised while it runs a callback of its own, of a weak reference or an
+    object's end, and the work would go on as if nothing had been asked.
+    """
+    signal.signal(signal.SIGALRM, lambda number, frame: _stop_if_dropped(kind))
+    signal.setitimer(signal.ITIMER_REAL, _AGAIN, _AGAIN)
+    raise kind
+
+
+def _stop_if_dropped(kind: type[BaseException]) -> None:
+    error = sys.exc_info()[1]
+    while error is not None:
+        if isinstance(error, kind):
+            # It is on its way, and threads are being waited for.
+            return
+        error = error.__context__
+    raise kind
+
+
+def _arrived() -> None:
+    signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def _unraisable(dropped: "sys.UnraisableHookArgs") -> None:
+    if not issubclass(dropped.exc_type, (_Terminated, _Interrupted)):
+        sys.__unraisablehook__(dropped)
 
 
 def _silence_libraries() -> None:

@@ -3,6 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
+from shadowtool.core.half_floats import rounded, to_float
+
 Float32 = NDArray[np.float32]
 
 # Logarithms of gains further from 0 are shadow, not exposure.
@@ -50,19 +53,29 @@ def frame_gain(image: Float32, reference: Float32) -> float:
 
 
 def common_reference(samples: list[Float32]) -> Float32:
-    """What most of a sample of frames show, with their own gains taken out; (h, w, 3)."""
+    """What most of a sample of frames show, with their own gains taken out; (h, w, 3).
+
+    Its own exposure is that of the most frames: where long shade pulls the median down, the light
+    that most of them agree in lifts it again.
+    """
     reference = np.median(samples, axis=0)
     gains = [frame_gain(sample, reference) for sample in samples]
     level = float(np.median(gains))
     corrected = [
         sample * np.float32(level / gain) for sample, gain in zip(samples, gains, strict=True)
     ]
-    return np.asarray(np.median(corrected, axis=0), np.float32)
+    reference = np.asarray(np.median(corrected, axis=0), np.float32)
+    usual = float(np.median([frame_gain(sample, reference) for sample in samples]))
+    return reference * np.float32(usual)
 
 
 def without_gain(image: NDArray[np.floating], gain: float) -> NDArray[np.floating]:
     """The frame as it would be at gain 1; the very same array if it is."""
     if gain == 1:
         return image
-    corrected = image.astype(np.float32) * np.float32(1 / gain)
-    return corrected.astype(np.float16) if image.dtype == np.float16 else corrected
+    if image.dtype != np.float16:
+        return image.astype(np.float32) * np.float32(1 / gain)
+    corrected = np.empty_like(image)
+    for rows in bands(image.shape):
+        corrected[rows] = rounded(to_float(image[rows]) * np.float32(1 / gain))
+    return corrected

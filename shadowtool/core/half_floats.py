@@ -24,12 +24,18 @@ def to_float(values: NDArray[np.floating]) -> Float32:
 
 def to_half(values: NDArray[np.floating]) -> Float16:
     """Round to half floats; what is too large becomes the largest half, NaN stays."""
-    if values.dtype != np.float32 or not values.size:
-        return np.asarray(np.clip(values, -65504, 65504), np.float16)
-    halfs = _converted(values, cv2.CV_16F).view(np.float16)
+    halfs = rounded(values)
     if all_finite(halfs):
         return halfs
     return np.asarray(np.clip(values, -65504, 65504), np.float16)
+
+
+def rounded(values: NDArray[np.floating]) -> Float16:
+    """Round to half floats; what is too large becomes infinite, NaN stays."""
+    if values.dtype != np.float32 or not values.size:
+        with np.errstate(over="ignore"):
+            return np.asarray(values, np.float16)
+    return _converted(values, cv2.CV_16F).view(np.float16)
 
 
 def all_finite(halfs: Float16) -> bool:

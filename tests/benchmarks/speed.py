@@ -30,7 +30,7 @@ from shadowtool.io.image import Header, write_exr, write_png
 from shadowtool.io.products import write_warp
 from shadowtool.parallel import ordered_map
 
-FULL_HD, FOUR_K, SMALL = (1920, 1080), (3840, 2160), (192, 108)
+FULL_HD, FOUR_K, QUARTER, SMALL = (1920, 1080), (3840, 2160), (480, 270), (192, 108)
 FIRST = 1001
 PROGRAM = (sys.executable, "-c", "from shadowtool.cli import main; main()")
 
@@ -302,6 +302,24 @@ def given_alpha(stage: Stage) -> Row:
     )
 
 
+def figure(stage: Stage) -> Row:
+    # Where the figure is all in the picture.
+    first = FIRST + stage.footage.frames // 2
+    numbers = [str(first + i) for i in range(6)]
+    words = ["matte", stage.path("take"), "--plates", stage.path("plates")]
+    script = str(Path(__file__).with_name("closed_form.py"))
+    peer = [sys.executable, script, stage.path("take"), stage.path("alpha"), *numbers]
+    absent = "" if importlib.util.find_spec("pymatting") else "pymatting is not installed"
+    return Row(
+        "matte, all of it",
+        len(numbers),
+        [
+            stage.ours([*words, "--frames", f"{numbers[0]}-{numbers[-1]}"]),
+            Rival("PyMatting closed form", peer, stage.work / "peer", absent, peer=True),
+        ],
+    )
+
+
 def composite(stage: Stage) -> Row:
     words = ["composite", "--fg", stage.path("fg"), "--beta-frames", stage.path("beta")]
     words += ["--plates", stage.path("plates"), "--warp", stage.path("warp.exr")]
@@ -355,6 +373,7 @@ ROWS: Mapping[str, Callable[[Stage], Row]] = {
     "minmax": minmax,
     "robust": robust,
     "matte": given_alpha,
+    "figure": figure,
     "composite": composite,
     "apply": applied,
     "scan": scan,
@@ -375,17 +394,24 @@ def show(row: Row, runs: int) -> None:
     """Time a row's rivals in turn, and print their medians beside what is asked."""
     present = [rival for rival in row.rivals if not rival.absent]
     times: dict[str, list[Spent]] = {rival.name: [] for rival in present}
+    failed: dict[str, str] = {}
     for turn in range(runs):
         for rival in present:
-            if turn == 0 or not rival.peer:
+            if turn > 0 and rival.peer:
+                continue
+            try:
                 times[rival.name].append(taken(rival))
+            except RuntimeError as error:
+                if not rival.peer:
+                    raise
+                failed[rival.name] = str(error).splitlines()[-1]
     print(f"\n{row.title}, {row.frames} frames")
     heads = ("", "wall s", "cpu s", "peak MB", "our wall", "our cpu", "asked")
     print(f"  {heads[0]:24}" + "".join(f"{head:>10}" for head in heads[1:]))
     ours = times[present[0].name]
     for rival in row.rivals:
-        if rival.absent:
-            print(f"  {rival.name:24}{rival.absent:>20}")
+        if absent := rival.absent or failed.get(rival.name):
+            print(f"  {rival.name:24}  {absent}")
             continue
         own = times[rival.name]
         middle = [statistics.median(values) for values in zip(*own, strict=True)]
@@ -458,16 +484,16 @@ def main() -> None:
         print(f"{options.jobs} threads, {len(os.sched_getaffinity(0))} CPUs, {options.runs} runs")
         if shutil.which("oiiotool") is None:
             print("oiiotool is not installed (Debian: openimageio-tools): its rows are left out")
-        if importlib.util.find_spec("pymatting") is None:
-            print("PyMatting is not installed (pip install pymatting)")
         if "start-up" in wanted:
             show_start_up(options.runs)
         for row in ROWS:
             if row in wanted:
-                show(ROWS[row](stage(FULL_HD, options.frames)), options.runs)
+                size = QUARTER if row == "figure" else FULL_HD
+                show(ROWS[row](stage(size, options.frames)), options.runs)
         if "growth" in wanted:
             small = [stage(SMALL, frames) for frames in (50, 1000)]
-            show_peaks("growth, 192x108: memory is to stay flat", small, list(ROWS))
+            names = [name for name in ROWS if name != "figure"]
+            show_peaks("growth, 192x108: memory is to stay flat", small, names)
         if "4k" in wanted:
             large = [stage(FOUR_K, 12)]
             show_peaks("3840x2160: below 1200 MB", large, list(ROWS), 1200)

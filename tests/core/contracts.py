@@ -84,7 +84,6 @@ def is_kept(contract: Contract, shrink: bool = True) -> None:
     @settings(
         max_examples=25,
         phases=[Phase.generate, *([Phase.shrink] if shrink else [])],
-        deadline=None,
         database=None,
         derandomize=True,
         suppress_health_check=list(HealthCheck),

@@ -118,3 +118,14 @@ def test_in_a_steady_take_a_shadow_that_most_frames_share_is_no_gain() -> None:
 
 def test_a_single_sample_is_its_own_reference() -> None:
     assert np.array_equal(common_reference([SCENE.lit]), SCENE.lit)
+
+
+def test_long_shade_does_not_lower_the_level_of_a_steady_take() -> None:
+    # A wide penumbra lies over each pixel for nearly half the frames.
+    samples = []
+    for i in range(24):
+        x = np.arange(SCENE.width)[None, :] - (8 * i - 20)
+        beta = np.broadcast_to(np.clip(np.abs(x) / 60, 0, 1), SCENE.lit.shape[:2])
+        samples.append(SCENE.noisy(SCENE.image(beta.astype(np.float32)), i))
+    reference = common_reference(samples)
+    assert np.median([frame_gain(sample, reference) for sample in samples]) == 1.0

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shadowtool.core.half_floats import all_finite, to_float, to_half
+from shadowtool.core.half_floats import all_finite, rounded, to_float, to_half
 
 EVERY_HALF = np.arange(1 << 16, dtype=np.uint32).astype(np.uint16).view(np.float16)
 SHAPES = [(1,), (4,), (1, 1), (4, 1), (1, 4), (4, 1, 3), (2, 2, 4), (3, 3, 7), (0, 3), (2, 3, 2, 2)]
@@ -23,7 +23,7 @@ def same_bits(one: np.ndarray, other: np.ndarray) -> bool:
     )
 
 
-def rounded(values: np.ndarray) -> np.ndarray:
+def clipped(values: np.ndarray) -> np.ndarray:
     return np.clip(values, -65504, 65504).astype(np.float16)
 
 
@@ -44,13 +44,13 @@ def test_half_way_between_two_halfs_rounds_to_even():
     finite = np.sort(EVERY_HALF[np.isfinite(EVERY_HALF) & (EVERY_HALF >= 0)]).astype(np.float64)
     middles = ((finite[1:] + finite[:-1]) / 2).astype(np.float32)
     for values in (middles, -middles, np.nextafter(middles, np.float32(np.inf))):
-        assert same_bits(to_half(values), rounded(values))
+        assert same_bits(to_half(values), clipped(values))
 
 
 @given(hnp.arrays(np.uint32, st.sampled_from(SHAPES)))
 def test_any_float_rounds_as_numpy_rounds_it(bits):
     values = bits.view(np.float32)
-    assert same_bits(to_half(values), rounded(values))
+    assert same_bits(to_half(values), clipped(values))
 
 
 @given(hnp.arrays(np.uint16, st.sampled_from(SHAPES)))
@@ -71,6 +71,14 @@ def test_what_is_too_large_becomes_the_largest_half_and_nan_stays():
     values = np.array([1e9, -1e9, np.inf, -np.inf, np.nan, 65519, 65520], np.float32)
     expected = [65504, -65504, 65504, -65504, np.nan, 65504, 65504]
     np.testing.assert_array_equal(to_half(values), np.array(expected, np.float16))
+
+
+@given(hnp.arrays(np.uint32, st.sampled_from(SHAPES)))
+def test_rounding_alone_makes_infinities(bits):
+    values = bits.view(np.float32)
+    with np.errstate(over="ignore"):
+        assert same_bits(rounded(values), values.astype(np.float16))
+        assert same_bits(rounded(values.astype(np.float64)), values.astype(np.float16))
 
 
 def test_single_floats_are_not_copied():

@@ -1,0 +1,69 @@
+"""Signals reach the command, whatever Python is doing when they arrive."""
+
+import os
+import signal
+import sys
+import time
+import weakref
+
+import pytest
+
+from shadowtool.cli import process
+
+
+@pytest.fixture(autouse=True)
+def handlers(monkeypatch):
+    monkeypatch.setattr(sys, "unraisablehook", process._unraisable)
+    monkeypatch.setattr(process, "_AGAIN", 0.05)
+    kept = {n: signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGINT, signal.SIGALRM)}
+    signal.signal(signal.SIGTERM, process._terminate)
+    signal.signal(signal.SIGINT, process._interrupt)
+    yield
+    process._arrived()
+    for number, handler in kept.items():
+        signal.signal(number, handler)
+
+
+def wait() -> None:
+    end = time.monotonic() + 5
+    while time.monotonic() < end:
+        time.sleep(0.01)
+
+
+class Something:
+    pass
+
+
+SIGNALS = [(signal.SIGTERM, process._Terminated), (signal.SIGINT, process._Interrupted)]
+
+
+@pytest.mark.parametrize(("number", "kind"), SIGNALS)
+def test_a_signal_that_python_dropped_comes_again(number, kind, capsys):
+    thing = Something()
+    reference = weakref.ref(thing, lambda _: os.kill(os.getpid(), number))
+    del thing
+    with pytest.raises(kind):
+        wait()
+    assert reference() is None
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("number", "kind"), SIGNALS)
+def test_what_is_tidied_up_meanwhile_is_not_disturbed(number, kind):
+    tidied = False
+    with pytest.raises(kind):
+        try:
+            os.kill(os.getpid(), number)
+            wait()
+        finally:
+            time.sleep(0.3)
+            tidied = True
+    assert tidied
+
+
+def test_other_things_that_cannot_be_raised_are_still_shown(capsys):
+    thing = Something()
+    reference = weakref.ref(thing, lambda _: 1 // 0)
+    del thing
+    assert reference() is None
+    assert "ZeroDivisionError" in capsys.readouterr().err

@@ -1,0 +1,28 @@
+"""Bands cover a picture, each row once, whatever its size."""
+
+import numpy as np
+import pytest
+
+from shadowtool.core.bands import bands, in_all_channels
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 1), (1, 100_000), (7, 200_000), (1080, 1920, 3), (2160, 3840), (5000, 1), (0, 4)]
+)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_every_row_is_in_one_band(shape, channels):
+    rows = [row for band in bands(shape, channels) for row in range(shape[0])[band]]
+    assert rows == list(range(shape[0]))
+
+
+def test_bands_hold_about_as_many_values_whatever_the_width():
+    for width in (1920, 3840):
+        band = next(iter(bands((2160, width))))
+        assert 50_000 < (band.stop - band.start) * width * 3 < 100_000
+
+
+def test_a_plane_is_the_same_in_all_channels():
+    plane = np.random.default_rng(0).random((4, 5), np.float32)
+    spread = in_all_channels(plane)
+    assert spread.shape == (4, 5, 3)
+    assert all(np.array_equal(spread[..., c], plane) for c in range(3))

@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.detection import Found, changed, find_figure, texture_evidence
+from tests.figures import BACKDROP, DARK, KNOWN, SCENE, disk, shot, strand
+
+
+def found_in(image: np.ndarray, backdrop: Backdrop = BACKDROP) -> Found:
+    return find_figure(image, backdrop, backdrop.nearest(image), KNOWN, KNOWN.size)
+
+
+@pytest.mark.parametrize("soft", [1, 6, 40])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_shadow_is_no_figure(soft: float, seed: int) -> None:
+    image = SCENE.noisy(SCENE.image(SCENE.disk(80, 50, radius=25, soft=soft)), seed)
+    assert not found_in(image).maybe.any()
+
+
+@pytest.mark.parametrize("deeper", [0.6, 0.8])
+def test_ground_that_loses_some_of_the_sky_is_no_figure(deeper: float) -> None:
+    beta = SCENE.disk(80, 50, radius=25, soft=6)
+    image = SCENE.image(beta)
+    image[40:60, 70:90] *= np.float32(deeper)
+    assert not found_in(SCENE.noisy(image, 2)).mask.any()
+
+
+@pytest.mark.parametrize("lit", [True, False])
+def test_a_figure_is_found_to_the_pixel_in_light_and_in_shadow(lit: bool) -> None:
+    alpha = disk(70, 50, 20)
+    beta = None if lit else SCENE.disk(70, 50, radius=40, soft=6)
+    mask = found_in(shot(alpha, beta).image).mask
+    assert mask[alpha == 1].all()
+    assert not mask[alpha == 0].any()
+
+
+def test_dark_clothes_in_shadow_are_told_from_it_by_the_texture_that_they_hide() -> None:
+    alpha = disk(70, 50, 20)
+    mask = found_in(shot(alpha, SCENE.disk(70, 50, radius=40, soft=6), DARK).image).mask
+    assert mask[alpha == 1].mean() > 0.99
+    assert not mask[disk(70, 50, 22) == 0].any()
+
+
+def test_a_hair_hangs_on_the_head() -> None:
+    head = disk(60, 60, 16)
+    hair = strand((60, 60), (110, 20), 0.8)
+    found = found_in(shot(np.maximum(head, hair)).image)
+    middle = (hair >= 0.5) & (disk(60, 60, 20) == 0)
+    assert found.maybe[middle].mean() > 0.95
+
+
+def test_specks_are_no_figure_and_a_pinhole_is_none_in_it() -> None:
+    alpha = disk(70, 50, 20)
+    alpha[10, 10], alpha[50, 70] = 1, 0
+    mask = found_in(shot(alpha).image).mask
+    assert not mask[10, 10]
+    assert mask[50, 70]
+
+
+def test_pixels_of_which_nothing_is_known_follow_their_neighbours() -> None:
+    alpha = disk(70, 50, 20)
+    unknown = np.zeros_like(KNOWN)
+    unknown[48:52, 68:72] = unknown[10:14, 10:14] = True
+    image = shot(alpha).image
+    image[unknown] = 0
+    mask = find_figure(image, BACKDROP, BACKDROP.nearest(image), unknown, KNOWN.size).mask
+    assert mask[48:52, 68:72].all() and not mask[10:14, 10:14].any()
+
+
+def test_texture_shows_through_any_shadow_and_not_through_a_figure() -> None:
+    shaded = texture_evidence(
+        SCENE.noisy(SCENE.image(SCENE.disk(80, 50, 30, soft=20)), 1), BACKDROP
+    )
+    assert (shaded < 0).mean() > 0.98
+    covered = texture_evidence(shot(np.ones(KNOWN.shape)).image, BACKDROP)
+    assert (covered > 0).mean() > 0.98
+
+
+def test_ground_without_texture_says_nothing() -> None:
+    even = np.full_like(SCENE.lit, 0.5)
+    evidence = texture_evidence(even, Backdrop(even, even / 4, BACKDROP.noise))
+    assert evidence == pytest.approx(0, abs=1e-4)
+
+
+def test_lit_ground_has_not_changed_and_a_shadow_has() -> None:
+    beta = SCENE.disk(80, 50, radius=20)
+    change = changed(SCENE.noisy(SCENE.image(beta), 5), BACKDROP)
+    assert change[beta < 0.5].all()
+    assert not change[SCENE.disk(80, 50, radius=27) == 1].any()

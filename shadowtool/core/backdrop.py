@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
+Places = tuple[slice, ...] | tuple[NDArray[np.intp], ...]
 
 # How much of S may be missing near to what stands on it.
 _DEEPEST = 0.5
@@ -39,7 +40,7 @@ class Backdrop:
     """The scene without the figure.
 
     Attributes:
-        lit, shadow: (H, W, 3) float32, linear light, without NaN.
+        lit, shadow: (H, W, 3) float32, linear light, without NaN; or any pixels of it, (..., 3).
         noise: the take's.
     """
 
@@ -47,16 +48,15 @@ class Backdrop:
     shadow: Float32
     noise: NoiseModel
 
-    def part(self, box: tuple[slice, slice]) -> "Backdrop":
-        """The rows and columns of a box."""
-        return Backdrop(self.lit[box], self.shadow[box], self.noise)
+    def at(self, places: Places) -> "Backdrop":
+        """Some of its pixels, by their rows and columns."""
+        return Backdrop(self.lit[places], self.shadow[places], self.noise)
 
     def under(self, beta: Float32) -> Float32:
-        """What is seen under β, (H, W, 3); below 0 what is darker than S."""
-        part = beta[..., np.newaxis]
-        return np.where(
-            part >= 0, self.shadow + part * (self.lit - self.shadow), self.shadow * (1 + part)
-        )
+        """What is seen under β, (..., 3); below 0 what is darker than S."""
+        lighter, deeper = np.maximum(beta, 0)[..., np.newaxis], np.minimum(beta, 0)[..., np.newaxis]
+        seen = lighter * self.lit + (1 + deeper - lighter) * self.shadow
+        return np.asarray(seen, np.float32)
 
     def variance(self, image: Float32) -> Float32:
         """Of what is seen of the background at these values, (..., 3): the noise's and the plates'
@@ -86,31 +86,32 @@ class Backdrop:
 
     def nearest(self, image: Float32) -> Nearest:
         """The background that is likest to each pixel of a frame (H, W, 3)."""
-        weight = np.float32(1) / self.variance(image)
-        above = image - self.shadow
-        span = self.lit - self.shadow
-        weighted = weight * above
-        square: Float32 = (weighted * above).sum(axis=-1)
-        between = self._along(weighted, weight, span, square, 0, 1)
-        below = self._along(weighted, weight, self.shadow, square, -_DEEPEST, 0)
-        deeper = below[1] < between[1]
-        return Nearest(
-            np.where(deeper, below[0], between[0]),
-            np.where(deeper, below[1], between[1]),
-            (weight * (image - self.lit) ** 2).sum(axis=-1),
+        shape = image.shape[:2]
+        square, from_lit2 = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        dots = np.zeros((2, *shape), np.float32)
+        lengths = np.full((2, *shape), 1e-9, np.float32)
+        variance = self.variance(image)
+        # By channel: sums over an axis of three are slow.
+        for channel in range(3):
+            weight = 1 / variance[..., channel]
+            shadow = self.shadow[..., channel]
+            above, span = image[..., channel] - shadow, self.lit[..., channel] - shadow
+            square += weight * above**2
+            from_lit2 += weight * (above - span) ** 2
+            for direction, dot, length in zip((span, shadow), dots, lengths, strict=True):
+                dot += weight * direction * above
+                length += weight * direction**2
+        between, below = (
+            np.clip(dot / length, low, high)
+            for dot, length, low, high in zip(dots, lengths, (0, -_DEEPEST), (1, 0), strict=True)
         )
-
-    @staticmethod
-    def _along(
-        weighted: Float32,
-        weight: Float32,
-        direction: Float32,
-        square: Float32,
-        low: float,
-        high: float,
-    ) -> tuple[Float32, Float32]:
-        """The likeliest part of a direction from S, and the squared distance that is left."""
-        length = np.maximum((weight * direction**2).sum(axis=-1), np.float32(1e-9))
-        dot = (weighted * direction).sum(axis=-1)
-        part = np.clip(dot / length, low, high).astype(np.float32)
-        return part, np.maximum(square - part * (2 * dot - part * length), 0)
+        off_between, off_below = (
+            np.maximum(square - part * (2 * dot - part * length), 0)
+            for part, dot, length in zip((between, below), dots, lengths, strict=True)
+        )
+        deeper = off_below < off_between
+        return Nearest(
+            np.where(deeper, below, between),
+            np.where(deeper, off_below, off_between),
+            from_lit2,
+        )

@@ -72,7 +72,7 @@ def find_figure(
         frame_size: how many pixels the whole frame has.
     """
     texture = texture_evidence(image, backdrop)
-    guide = np.rint(np.clip(image, 0, 1) ** np.float32(_GUIDE_POWER) * 255).astype(np.uint8)
+    guide = (np.clip(image, 0, 1) ** np.float32(_GUIDE_POWER) * 255).astype(np.uint8)
 
     def mask_of(distance2: Float32) -> Bool:
         evidence = np.minimum(distance2 / 2 - _NEAR_LINE, nearest.from_lit2 / 2 - _NEAR_LIT)
@@ -100,9 +100,9 @@ def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:
 
     Above 0 the ground's texture is hidden, below 0 it shows, 0 if it has none.
     """
-    value = np.maximum(image.sum(axis=-1), np.float32(1e-3))
+    value = np.maximum(_sum(image), np.float32(1e-3))
     seen = np.log(value)
-    known = np.log(np.maximum(backdrop.lit.sum(axis=-1), np.float32(1e-3)))
+    known = np.log(np.maximum(_sum(backdrop.lit), np.float32(1e-3)))
     noise = backdrop.noise
     slope, floor = np.float32(noise.slope.mean()), np.float32(noise.floor.sum())
     scatter = 4 * ((slope * value + floor) / value**2 + np.float32(_LEAST_TEXTURE**2 / 2))
@@ -117,6 +117,11 @@ def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:
     ratio = cv2.blur(showing, window) / cv2.blur(hidden, window)
     evidence = np.float32(size**2 / _REPEATED) * np.log(ratio)
     return np.asarray(np.clip(evidence, -_MOST_TEXTURE, _MOST_TEXTURE), np.float32)
+
+
+def _sum(image: Float32) -> Float32:
+    """Of the channels."""
+    return np.asarray(image[..., 0] + image[..., 1] + image[..., 2], np.float32)
 
 
 def _background_error(nearest: Nearest, mask: Bool) -> Float32:

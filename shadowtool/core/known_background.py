@@ -141,11 +141,9 @@ def _gather(
 ) -> _Pixels:
     rows, columns = unknown
     height, width = solid.shape
-    sample = image[unknown]
-    lit, shadow = backdrop.lit[unknown], backdrop.shadow[unknown]
-    beta = behind[unknown]
-    ground = backdrop.under(behind)[unknown]
-    shift = np.where(beta[:, np.newaxis] >= 0, lit - shadow, shadow)
+    sample, beta, plates = image[unknown], behind[unknown], backdrop.at(unknown)
+    ground = plates.under(beta)
+    shift = np.where(beta[:, np.newaxis] >= 0, plates.lit - plates.shadow, plates.shadow)
     smooth, near = _near_parts(image, solid)
     steps = [(0, 0)]
     for turn in range(8):
@@ -164,8 +162,8 @@ def _gather(
         seen=_by_channel(sample),
         behind=_by_channel(ground),
         shift=_by_channel(shift),
-        noise=_by_channel(backdrop.noise_variance(sample)),
-        error=_by_channel(backdrop.own_variance(ground)),
+        noise=_by_channel(plates.noise_variance(sample)),
+        error=_by_channel(plates.own_variance(ground)),
         even=_unevenness(behind)[unknown][:, np.newaxis],
         figure=np.ascontiguousarray(np.moveaxis(smooth.reshape(-1, 3)[chosen], -1, 0)),
         far=(away / (2 * _FAR**2)).astype(np.float32),

@@ -59,7 +59,7 @@ def pull_figure(
     if box is None:
         return Figure(foreground, alpha, trimap)
     reach = max(_REACH, round(_REACH_PART * width))
-    part, ground = seen[box], backdrop.part(box)
+    part, ground = seen[box], backdrop.at(box)
     nearest = ground.nearest(part)
     found = find_figure(part, ground, nearest, unknown[box], height * width)
     if drawn is None:
@@ -95,7 +95,7 @@ def colour_figure(image: Float32, backdrop: Backdrop, unknown: Bool, alpha: Floa
     box = _around(alpha > 0)
     if box is not None:
         seen, unknown, bad = _without_unknown(image, backdrop, unknown)
-        part, ground = seen[box], backdrop.part(box)
+        part, ground = seen[box], backdrop.at(box)
         seen_ground = (alpha[box] == 0) & ~unknown[box]
         behind = ground_beta(ground.nearest(part).beta, seen_ground)
         foreground[box] = alpha[box][..., np.newaxis] * colours(part, alpha[box], behind, ground)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.backdrop import Backdrop, Nearest
+from shadowtool.core.trimap import BACKGROUND, FIGURE
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -21,9 +22,10 @@ Bool = NDArray[np.bool_]
 # What is still evidence for the background: half a squared distance from its line, and from L.
 # A figure's colours are spread over so many times more of what a pixel can be.
 _NEAR_LINE, _NEAR_LIT = 6.0, 9.0
-# No single pixel says more than this, and no texture.
-_MOST = 8.0
-_MOST_TEXTURE = 6.0
+# No single pixel's colour says more than this, and no texture.
+_MOST, _MOST_TEXTURE = 8.0, 6.0
+# A trimap from another frame is worth as much: it decides where colours don't.
+_HINT = 6.0
 # Of textures within this many pixels; a step of the logarithm above the second is an edge.
 _TEXTURE_RADIUS, _STEP, _LEAST_TEXTURE = 4, 0.6, 0.03
 # Neighbouring gradients repeat each other: so many count as one.
@@ -61,7 +63,12 @@ def changed(image: Float32, backdrop: Backdrop) -> Bool:
 
 
 def find_figure(
-    image: Float32, backdrop: Backdrop, nearest: Nearest, unknown: Bool, frame_size: int
+    image: Float32,
+    backdrop: Backdrop,
+    nearest: Nearest,
+    unknown: Bool,
+    hint: UInt8,
+    frame_size: int,
 ) -> Found:
     """The figure in a frame, or in a part of it.
 
@@ -69,15 +76,19 @@ def find_figure(
         image: (H, W, 3), linear light, without NaN.
         nearest: `Backdrop.nearest` of it.
         unknown: (H, W), nothing can be said of the pixel.
+        hint: (H, W) uint8, a trimap that may be a little off; 128 says nothing.
         frame_size: how many pixels the whole frame has.
     """
-    texture = texture_evidence(image, backdrop)
+    other = texture_evidence(image, backdrop)
+    other[unknown] = 0
+    other += np.float32(_HINT) * ((hint == FIGURE).astype(np.float32) - (hint == BACKGROUND))
     guide = (np.clip(image, 0, 1) ** np.float32(_GUIDE_POWER) * 255).astype(np.uint8)
 
     def mask_of(distance2: Float32) -> Bool:
         evidence = np.minimum(distance2 / 2 - _NEAR_LINE, nearest.from_lit2 / 2 - _NEAR_LIT)
-        evidence = np.clip(evidence, -_MOST, _MOST) + texture
+        evidence = np.clip(evidence, -_MOST, _MOST)
         evidence[unknown] = 0
+        evidence += other
         shared = cv2.ximgproc.fastGlobalSmootherFilter(guide, evidence, _SHARING, _LIKE)
         figure = (shared > 0).astype(np.uint8)
         square = np.ones((3, 3), np.uint8)

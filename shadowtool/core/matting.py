@@ -38,14 +38,20 @@ class Figure(NamedTuple):
 
 
 def pull_figure(
-    image: Float32, backdrop: Backdrop, unknown: Bool, drawn: UInt8 | None = None
+    image: Float32,
+    backdrop: Backdrop,
+    unknown: Bool,
+    drawn: UInt8 | None = None,
+    hint: UInt8 | None = None,
 ) -> Figure:
     """The figure in a frame, its alpha, colour and trimap.
 
     Args:
         image: (H, W, 3) float32, linear light; where it is not finite it is unknown.
         unknown: (H, W), the plates say nothing of the pixel.
-        drawn: (H, W) uint8, a trimap from elsewhere whose 0 and 255 are kept; none by default.
+        drawn: (H, W) uint8, a trimap from elsewhere whose 0 and 255 are kept; what is 128 in it is
+            found as without one.
+        hint: (H, W) uint8, a trimap that may be a little off, for what the frame leaves open.
 
     Returns:
         The figure; empty if there is none, black where the frame is unknown.
@@ -53,22 +59,21 @@ def pull_figure(
     height, width = image.shape[:2]
     alpha = np.zeros((height, width), np.float32)
     foreground = np.zeros((height, width, 3), np.float32)
-    trimap = np.zeros((height, width), np.uint8) if drawn is None else drawn
+    if drawn is None:
+        drawn = np.full((height, width), UNKNOWN, np.uint8)
+    trimap = np.where(drawn == FIGURE, FIGURE, BACKGROUND)
     seen, unknown, bad = _without_unknown(image, backdrop, unknown)
-    box = _around(changed(seen, backdrop) | (trimap > BACKGROUND))
+    box = _around(changed(seen, backdrop) | (trimap == FIGURE))
     if box is None:
         return Figure(foreground, alpha, trimap)
     reach = max(_REACH, round(_REACH_PART * width))
     part, ground = seen[box], backdrop.at(box)
     nearest = ground.nearest(part)
-    found = find_figure(part, ground, nearest, unknown[box], height * width)
-    if drawn is None:
-        wide = wide_trimap(found.mask, found.maybe, reach)
-    else:
-        found = _within(found, drawn[box])
-        wide = np.where(
-            drawn[box] == UNKNOWN, wide_trimap(found.mask, found.maybe, reach), drawn[box]
-        )
+    hint = drawn if hint is None else hint
+    found = find_figure(part, ground, nearest, unknown[box], hint[box], height * width)
+    found = _within(found, drawn[box])
+    wide = wide_trimap(found.mask, found.maybe, reach)
+    wide = np.where(drawn[box] == UNKNOWN, wide, drawn[box])
     behind = ground_beta(nearest.beta, (wide == BACKGROUND) & ~unknown[box])
     first = solve(part, wide, behind, ground)
     prior = edge_prior(first.alpha, first.error, first.misfit, wide, found.mask, reach)
@@ -78,8 +83,7 @@ def pull_figure(
     alpha[box] = np.where(whole < _NOTHING, np.float32(0), whole)
     foreground[box] = alpha[box][..., np.newaxis] * solved.foreground
     foreground[bad] = 0
-    if drawn is None:
-        trimap[box] = narrow
+    trimap[box] = narrow
     return Figure(foreground, alpha, trimap)
 
 

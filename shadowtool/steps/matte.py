@@ -21,6 +21,7 @@ from shadowtool.io.image import EXR, PNG, Header, read_image, to_half, write_exr
 from shadowtool.io.products import read_plates
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import Footage, open_footage, require_frames, require_size
+from shadowtool.steps.keyframes import Keyframes
 from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
 
 logger = logging.getLogger(__name__)
@@ -60,7 +61,8 @@ def matte(
     Args:
         plates: the folder of the source scene's plates.
         alpha: the figure's matte from elsewhere, used as given; no trimap is then made.
-        trimap: 0, 128, 255 for every frame, used instead of one by difference.
+        trimap: 0, 128, 255 for any of the frames; where one was drawn, it decides, and between
+            them they are carried by optical flow.
         only: write one of the three products.
         beta: one β for all channels, or one for each, for coloured light.
         clamp: keep β within 0 and 1; caustics are above.
@@ -81,9 +83,12 @@ def matte(
         for role, path in (("alpha", alpha), ("trimap", trimap))
         if path is not None
     }
-    for sequence in given.values():
+    keyframes = None
+    if "trimap" in given:
+        keyframes = Keyframes.of(given["trimap"], footage, run.missing)
+    if "alpha" in given:
         pattern = footage.sequence.pattern
-        require_frames(sequence, frames, footage.header, pattern, run.missing)
+        require_frames(given["alpha"], frames, footage.header, pattern, run.missing)
     noise = footage.measure_noise(run.jobs)
     recipe = Recipe(
         "matte",
@@ -107,7 +112,7 @@ def matte(
         footage,
         _Scene.of(stored.plates, noise, footage.header, beta),
         given.get("alpha"),
-        given.get("trimap"),
+        keyframes,
         wanted,
         beta,
         clamp,
@@ -188,7 +193,7 @@ class _Take:
     footage: Footage
     scene: _Scene
     alpha: Sequence | None
-    trimap: Sequence | None
+    keyframes: Keyframes | None
     wanted: tuple[Only, ...]
     beta: Beta
     clamp: bool
@@ -200,8 +205,10 @@ class _Take:
         return [self._file(product, frame) for product in self.wanted]
 
     def sources(self, frame: Frame) -> list[Path]:
-        sequences = (self.footage.sequence, self.alpha, self.trimap)
-        return [sequence.path(frame) for sequence in sequences if sequence is not None]
+        files = [self.footage.sequence.path(frame)]
+        if self.alpha is not None:
+            return [*files, self.alpha.path(frame)]
+        return files if self.keyframes is None else [*files, *self.keyframes.sources(frame)]
 
     def make(self, frame: Frame, provenance: dict[str, str]) -> Figures:
         """Write a frame's products."""
@@ -261,8 +268,12 @@ class _Take:
         if self.alpha is not None:
             alpha = np.clip(_matte_plane(self.alpha.path(frame)), 0, 1)
             return colour_figure(image, backdrop, unknown, alpha)
-        drawn = None if self.trimap is None else _trimap_plane(self.trimap.path(frame))
-        return pull_figure(image, backdrop, unknown, drawn)
+        if self.keyframes is None:
+            return pull_figure(image, backdrop, unknown)
+        trimap = self.keyframes.trimap(frame)
+        if frame not in self.keyframes.drawn.files:
+            return pull_figure(image, backdrop, unknown, hint=trimap)
+        return pull_figure(image, backdrop, unknown, trimap)._replace(trimap=trimap)
 
     def _beta(self, image: Float32, hidden: Bool) -> tuple[Float32, Bool]:
         """β (H, W) or (H, W, 3), filled, and where it was not measured."""
@@ -286,11 +297,3 @@ class _Take:
 def _matte_plane(path: Path) -> Float32:
     plane = read_image(path).plane("A", "Y", "R")
     return np.nan_to_num(plane, nan=0.0)
-
-
-def _trimap_plane(path: Path) -> NDArray[np.uint8]:
-    plane = np.nan_to_num(read_image(path).plane("Y", "G"))
-    trimap = np.full(plane.shape, 128, np.uint8)
-    trimap[plane < 0.25] = 0
-    trimap[plane > 0.75] = 255
-    return trimap

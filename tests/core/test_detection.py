@@ -3,11 +3,14 @@ import pytest
 
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.detection import Found, changed, find_figure, texture_evidence
+from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
 from tests.figures import BACKDROP, DARK, KNOWN, SCENE, disk, shot, strand
 
+NOTHING = np.full(KNOWN.shape, UNKNOWN, np.uint8)
 
-def found_in(image: np.ndarray, backdrop: Backdrop = BACKDROP) -> Found:
-    return find_figure(image, backdrop, backdrop.nearest(image), KNOWN, KNOWN.size)
+
+def found_in(image: np.ndarray, backdrop: Backdrop = BACKDROP, hint: np.ndarray = NOTHING) -> Found:
+    return find_figure(image, backdrop, backdrop.nearest(image), KNOWN, hint, KNOWN.size)
 
 
 @pytest.mark.parametrize("soft", [1, 6, 40])
@@ -63,8 +66,20 @@ def test_pixels_of_which_nothing_is_known_follow_their_neighbours() -> None:
     unknown[48:52, 68:72] = unknown[10:14, 10:14] = True
     image = shot(alpha).image
     image[unknown] = 0
-    mask = find_figure(image, BACKDROP, BACKDROP.nearest(image), unknown, KNOWN.size).mask
+    mask = find_figure(image, BACKDROP, BACKDROP.nearest(image), unknown, NOTHING, KNOWN.size).mask
     assert mask[48:52, 68:72].all() and not mask[10:14, 10:14].any()
+
+
+def test_a_hint_decides_where_the_frame_says_nothing_and_nowhere_else() -> None:
+    even = np.full_like(SCENE.lit, 0.5)
+    backdrop = Backdrop(even, even / 4, BACKDROP.noise)
+    figure, hole = disk(60, 50, 20) > 0, disk(60, 50, 8) > 0
+    image = np.where(figure[..., None] & ~hole[..., None], np.float32([0.1, 0.2, 0.6]), even)
+    hint = np.where(figure, FIGURE, BACKGROUND)
+    assert found_in(image, backdrop, hint).mask[hole].mean() < 0.1
+    dark = np.where(hole[..., None], np.float32(0.2), image)
+    assert found_in(dark, backdrop, hint).mask[hole].all()
+    assert not found_in(even, backdrop, hint).mask.any()
 
 
 def test_texture_shows_through_any_shadow_and_not_through_a_figure() -> None:

@@ -37,7 +37,9 @@ _SHARING, _LIKE, _GUIDE_POWER = 20.0, 10.0, 0.3
 _OFF_LINE2 = 12.0
 # Of normal noise 9 pixels in 10 are within this distance of the line, in two dimensions.
 _NINE_TENTHS = 2.15
-_LARGEST_ERROR = 3.0
+_LARGEST_ERROR, _LEAST_SAMPLE = 3.0, 100
+# What is so many pixels from the figure has nothing of it; beside it begins sooner.
+_AWAY, _BESIDE = 5, 1
 # A figure is at least this part of the picture, a hole in it at least that; neither is but a few
 # pixels.
 _LEAST_FIGURE, _LEAST_HOLE, _FEW = 1 / 5000, 1 / 20000, 4
@@ -81,7 +83,7 @@ def find_figure(
     """
     other = texture_evidence(image, backdrop)
     other[unknown] = 0
-    other += np.float32(_HINT) * ((hint == FIGURE).astype(np.float32) - (hint == BACKGROUND))
+    other += np.float32(_HINT) * _leaning(hint)
     guide = (np.clip(image, 0, 1) ** np.float32(_GUIDE_POWER) * 255).astype(np.uint8)
 
     def mask_of(distance2: Float32) -> Bool:
@@ -130,6 +132,20 @@ def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:
     return np.asarray(np.clip(evidence, -_MOST_TEXTURE, _MOST_TEXTURE), np.float32)
 
 
+def _leaning(hint: UInt8) -> Float32:
+    """1 in a trimap's figure, -1 in its background, and half as much at their borders, falling from
+    one to the other, (H, W): bands are drawn with the edge about in their middle."""
+    sure = np.where(hint == FIGURE, np.float32(1), -(hint == BACKGROUND).astype(np.float32))
+    if not ((hint == FIGURE).any() and (hint == BACKGROUND).any()):
+        return sure
+    figure, background = (
+        cv2.distanceTransform((hint != value).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        for value in (FIGURE, BACKGROUND)
+    )
+    between = (background - figure) / (2 * (background + figure))
+    return np.asarray(np.where(sure == 0, between, sure), np.float32)
+
+
 def _sum(image: Float32) -> Float32:
     """Of the channels."""
     return np.asarray(image[..., 0] + image[..., 1] + image[..., 2], np.float32)
@@ -137,15 +153,18 @@ def _sum(image: Float32) -> Float32:
 
 def _background_error(nearest: Nearest, mask: Bool) -> Float32:
     """By how much more than noise the background is off its line, (H, W) ≥ 1: compression and
-    coarse chroma, which do most harm in shade and at its edge."""
-    size = 2 * _TEXTURE_RADIUS + 1
-    away = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) == 0
+    coarse chroma, which do most harm around what moves, in shade and at its edge."""
+    figure = mask.astype(np.uint8)
+    away, beside = (
+        cv2.dilate(figure, np.ones((2 * radius + 1,) * 2, np.uint8)) == 0
+        for radius in (_AWAY, _BESIDE)
+    )
     error = np.ones(mask.shape, np.float32)
-    shades = (nearest.beta < 0.03, (nearest.beta >= 0.03) & (nearest.beta < 0.95))
-    for shade in shades:
-        sample = nearest.distance2[shade & away]
-        if sample.size >= 100:
-            typical = np.sqrt(np.quantile(sample, 0.9)) / _NINE_TENTHS
+    full, part = nearest.beta < 0.03, (nearest.beta >= 0.03) & (nearest.beta < 0.95)
+    for shade, sample in ((full, away), (part, away), (~full & ~part, beside & ~away)):
+        distance2 = nearest.distance2[shade & sample]
+        if distance2.size >= _LEAST_SAMPLE:
+            typical = np.sqrt(np.quantile(distance2, 0.9)) / _NINE_TENTHS
             error[shade] = np.clip(typical, 1, _LARGEST_ERROR)
     return error
 

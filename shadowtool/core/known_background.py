@@ -26,6 +26,8 @@ Bool = NDArray[np.bool_]
 _COLOUR, _LEAST_COLOUR = 0.1, 0.002
 # How far β is from that of the ground around where that is even.
 _BETA = 0.03
+# Under a foot there may be shadow that is only seen so far away, rarely: exp(-the second).
+_DARKEST_RADIUS, _UNSEEN = 6, 4.0
 # Within so many pixels β is looked at for evenness.
 _EVEN_RADIUS = 4
 # What near parts of the figure are tried: the nearest, and those nearest to places this far off;
@@ -88,7 +90,9 @@ def solve(
         deviation = np.full(unknown[0].shape, 3, np.float32)
         if prior is not None:
             mean, deviation = prior.mean[unknown], prior.deviation[unknown]
-        pixels = _gather(image, trimap == FIGURE, unknown, behind, backdrop)
+        pixels = _gather(
+            image, trimap == FIGURE, unknown, behind, backdrop, darkest=prior is not None
+        )
         result = _most_probable(pixels, mean, deviation)
         alpha[unknown], error[unknown], misfit[unknown] = result[:3]
         foreground[unknown] = _colour(pixels, *result[0::3]).T
@@ -107,7 +111,7 @@ def colours(image: Float32, alpha: Float32, behind: Float32, backdrop: Backdrop)
     foreground = np.where((solid & (alpha > 0))[..., np.newaxis], image, np.float32(0))
     unknown = np.nonzero((alpha > 0) & ~solid)
     if unknown[0].size:
-        pixels = _gather(image, solid, unknown, behind, backdrop)
+        pixels = _gather(image, solid, unknown, behind, backdrop, darkest=True)
         given = alpha[unknown]
         result = _most_probable(pixels, given, np.full(given.shape, 1e-3, np.float32))
         foreground[unknown] = _colour(pixels, given, result[3]).T
@@ -118,18 +122,18 @@ class _Pixels(NamedTuple):
     """N pixels that are mixed, and K near parts of the figure for each; colours by channel.
 
     Attributes:
-        seen, behind, shift, noise: (3, N, 1), C, B, by how much B changes with β, and the variance
-            of C's noise.
-        error: (3, N, 1), variance of B's own error.
+        seen, noise: (3, N, 1), C and the variance of its noise.
+        behind, shift, error: (3, N, K), B, by how much it changes with β, and the variance of its
+            own error.
         even: (N, 1), standard deviation of β.
         figure: (3, N, K), F of the near parts.
         far: (N, K), how much the likelihood's logarithm falls with their distance.
     """
 
     seen: Float32
+    noise: Float32
     behind: Float32
     shift: Float32
-    noise: Float32
     error: Float32
     even: Float32
     figure: Float32
@@ -137,18 +141,28 @@ class _Pixels(NamedTuple):
 
 
 def _gather(
-    image: Float32, solid: Bool, unknown: Places, behind: Float32, backdrop: Backdrop
+    image: Float32,
+    solid: Bool,
+    unknown: Places,
+    behind: Float32,
+    backdrop: Backdrop,
+    darkest: bool,
 ) -> _Pixels:
+    """With ``darkest`` the last near part is the nearest once more, before the darkest ground
+    around."""
     rows, columns = unknown
     height, width = solid.shape
-    sample, beta, plates = image[unknown], behind[unknown], backdrop.at(unknown)
-    ground = plates.under(beta)
-    shift = np.where(beta[:, np.newaxis] >= 0, plates.lit - plates.shadow, plates.shadow)
-    smooth, near = _near_parts(image, solid)
     steps = [(0, 0)]
     for turn in range(8):
         angle = turn * np.pi / 4
         steps.append((round(_AROUND * np.sin(angle)), round(_AROUND * np.cos(angle))))
+    betas, which = [behind[unknown]], [0] * len(steps)
+    if darkest:
+        window = np.ones((2 * _DARKEST_RADIUS + 1,) * 2, np.uint8)
+        betas.append(np.asarray(cv2.erode(behind, window)[unknown], np.float32))
+        which.append(1)
+        steps.append(steps[0])
+    smooth, near = _near_parts(image, solid)
     chosen = np.stack(
         [
             near[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]
@@ -158,21 +172,28 @@ def _gather(
     )
     away = (chosen // width - rows[:, np.newaxis]) ** 2
     away = away + (chosen % width - columns[:, np.newaxis]) ** 2
+    far = (away / (2 * _FAR**2)).astype(np.float32)
+    if darkest:
+        far[:, -1] += np.float32(_UNSEEN)
+    sample, plates = image[unknown], backdrop.at(unknown)
+    span = plates.lit - plates.shadow
+    shifts = [np.where(beta[:, np.newaxis] >= 0, span, plates.shadow) for beta in betas]
+    grounds = [plates.under(beta) for beta in betas]
     return _Pixels(
         seen=_by_channel(sample),
-        behind=_by_channel(ground),
-        shift=_by_channel(shift),
         noise=_by_channel(plates.noise_variance(sample)),
-        error=_by_channel(plates.own_variance(ground)),
+        behind=_by_channel(*grounds)[..., which],
+        shift=_by_channel(*shifts)[..., which],
+        error=_by_channel(*(plates.own_variance(ground) for ground in grounds))[..., which],
         even=_unevenness(behind)[unknown][:, np.newaxis],
         figure=np.ascontiguousarray(np.moveaxis(smooth.reshape(-1, 3)[chosen], -1, 0)),
-        far=(away / (2 * _FAR**2)).astype(np.float32),
+        far=far,
     )
 
 
-def _by_channel(values: Float32) -> Float32:
-    """(N, 3) as (3, N, 1)."""
-    return np.ascontiguousarray(values.T)[..., np.newaxis]
+def _by_channel(*values: Float32) -> Float32:
+    """K times (N, 3) as (3, N, K)."""
+    return np.stack([value.T for value in values], axis=-1)
 
 
 def _near_parts(image: Float32, solid: Bool) -> tuple[Float32, Index]:
@@ -244,8 +265,8 @@ def _colour(pixels: _Pixels, alpha: Float32, share: Float32) -> Float32:
     """F (3, N) for a known alpha: between that of the near parts and what C tells of it."""
     expected = (share * pixels.figure).sum(axis=-1)
     prior = _colour_variance(expected)
-    seen, behind = pixels.seen[..., 0], pixels.behind[..., 0]
-    shift = pixels.shift[..., 0] * pixels.even[:, 0]
-    noise = pixels.noise[..., 0] + (1 - alpha) ** 2 * (pixels.error[..., 0] + shift**2)
+    seen, behind = pixels.seen[..., 0], (share * pixels.behind).sum(axis=-1)
+    error = (share * (pixels.error + (pixels.even * pixels.shift) ** 2)).sum(axis=-1)
+    noise = pixels.noise[..., 0] + (1 - alpha) ** 2 * error
     rest = seen - alpha * expected - (1 - alpha) * behind
     return np.asarray(expected + alpha * prior / (alpha**2 * prior + noise) * rest, np.float32)

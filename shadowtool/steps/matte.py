@@ -228,7 +228,8 @@ class _Take:
         }
         marked = with_figures(provenance, figures)
         if "alpha" in self.wanted:
-            rgba = to_half(np.dstack([figure.foreground, figure.alpha]))
+            rgba = np.empty((*hidden.shape, 4), np.float16)
+            rgba[..., :3], rgba[..., 3] = to_half(figure.foreground), to_half(figure.alpha)
             write_exr(self._file("alpha", frame), {"RGBA": rgba}, shown.header, marked)
         if "beta" in self.wanted:
             confidence = np.where(unknown, np.float32(0), self.scene.confidence)
@@ -255,7 +256,8 @@ class _Take:
     def _shown(self, frame: Frame) -> _Shown:
         stored = self.footage.image(frame)
         image = stored.rgb(self.footage.transfer).astype(np.float32)
-        bad = ~np.isfinite(image).all(axis=-1)
+        finite = np.isfinite(image)
+        bad = ~(finite[..., 0] & finite[..., 1] & finite[..., 2])
         image[bad] = np.nan
         gain = 1.0
         if self.gain == "auto":

@@ -24,8 +24,10 @@ Bool = NDArray[np.bool_]
 
 # How far the figure's colour is from that of its near part, as a part of it, and at least.
 _COLOUR, _LEAST_COLOUR = 0.1, 0.002
+# Once alpha is known, how far the pixel's own may be.
+_OWN_COLOUR = 0.6
 # How far β is from that of the ground around where that is even.
-_BETA = 0.03
+_BETA = 0.02
 # Under a foot there may be shadow that is only seen so far away, rarely: exp(-the second).
 _DARKEST_RADIUS, _UNSEEN = 6, 4.0
 # Within so many pixels β is looked at for evenness.
@@ -95,7 +97,7 @@ def solve(
         )
         result = _most_probable(pixels, mean, deviation)
         alpha[unknown], error[unknown], misfit[unknown] = result[:3]
-        foreground[unknown] = _colour(pixels, *result[0::3]).T
+        foreground[unknown] = _colour(pixels, result[0], result[1], result[3]).T
     return Solved(alpha, foreground, error, misfit)
 
 
@@ -114,7 +116,7 @@ def colours(image: Float32, alpha: Float32, behind: Float32, backdrop: Backdrop)
         pixels = _gather(image, solid, unknown, behind, backdrop, darkest=True)
         given = alpha[unknown]
         result = _most_probable(pixels, given, np.full(given.shape, 1e-3, np.float32))
-        foreground[unknown] = _colour(pixels, given, result[3]).T
+        foreground[unknown] = _colour(pixels, given, np.zeros_like(given), result[3]).T
     return np.maximum(foreground, 0)
 
 
@@ -261,12 +263,17 @@ def _colour_variance(figure: Float32) -> Float32:
     return np.asarray((np.float32(_COLOUR) * figure + np.float32(_LEAST_COLOUR)) ** 2, np.float32)
 
 
-def _colour(pixels: _Pixels, alpha: Float32, share: Float32) -> Float32:
-    """F (3, N) for a known alpha: between that of the near parts and what C tells of it."""
+def _colour(pixels: _Pixels, alpha: Float32, uncertain: Float32, share: Float32) -> Float32:
+    """F (3, N) for an alpha that is known but for its standard deviation: between that of the near
+    parts and what C tells of it."""
     expected = (share * pixels.figure).sum(axis=-1)
-    prior = _colour_variance(expected)
-    seen, behind = pixels.seen[..., 0], (share * pixels.behind).sum(axis=-1)
-    error = (share * (pixels.error + (pixels.even * pixels.shift) ** 2)).sum(axis=-1)
-    noise = pixels.noise[..., 0] + (1 - alpha) ** 2 * error
-    rest = seen - alpha * expected - (1 - alpha) * behind
-    return np.asarray(expected + alpha * prior / (alpha**2 * prior + noise) * rest, np.float32)
+    prior = (np.float32(_OWN_COLOUR) * expected + np.float32(_LEAST_COLOUR)) ** 2
+    behind, error = ((share * values).sum(axis=-1) for values in (pixels.behind, pixels.error))
+    rest = pixels.seen[..., 0] - alpha * expected - (1 - alpha) * behind
+    variance = alpha**2 * prior + pixels.noise[..., 0] + (1 - alpha) ** 2 * error
+    variance = variance + (uncertain * (expected - behind)) ** 2
+    # What β may be off by errs in all channels together: rank one more in the covariance.
+    off = (1 - alpha) * (share * pixels.even * pixels.shift).sum(axis=-1)
+    together = (off * rest / variance).sum(axis=0) / (1 + (off**2 / variance).sum(axis=0))
+    rest = rest - together * off
+    return np.asarray(expected + alpha * prior * rest / variance, np.float32)

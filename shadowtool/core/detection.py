@@ -21,15 +21,14 @@ Bool = NDArray[np.bool_]
 
 # What is still evidence for the background: half a squared distance from its line, and from L.
 # A figure's colours are spread over so many times more of what a pixel can be.
-_NEAR_LINE, _NEAR_LIT = 6.0, 9.0
-# No single pixel's colour says more than this, and no texture.
+_NEAR_LINE, _NEAR_LIT = 5.0, 9.0
+# No single pixel's colour says more than this, and no step between two.
 _MOST, _MOST_TEXTURE = 8.0, 6.0
 # A trimap from another frame is worth as much: it decides where colours don't.
 _HINT = 6.0
-# Of textures within this many pixels; a step of the logarithm above the second is an edge.
-_TEXTURE_RADIUS, _STEP, _LEAST_TEXTURE = 4, 0.6, 0.03
-# Neighbouring gradients repeat each other: so many count as one.
-_REPEATED = 8.0
+# Logarithms are exact to the second, besides noise; steps that are off by more than the first count
+# less and less.
+_STEP, _LEAST_TEXTURE = 0.2, 0.03
 # Strength and range of the sharing, in 8-bit levels of this power of linear light: shade has as
 # many as light.
 _SHARING, _LIKE, _GUIDE_POWER = 20.0, 10.0, 0.3
@@ -109,27 +108,30 @@ def find_figure(
 
 
 def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:
-    """How much better log C keeps level around a pixel than log C - log L does, (H, W).
+    """How much better steps of log C from pixel to pixel are none than those of log L, (H, W).
 
-    Above 0 the ground's texture is hidden, below 0 it shows, 0 if it has none.
+    Above 0 the ground's texture is hidden, below 0 it shows, 0 if it has none. Each pixel has half
+    of what the steps around it say.
     """
     value = np.maximum(_sum(image), np.float32(1e-3))
     seen = np.log(value)
     known = np.log(np.maximum(_sum(backdrop.lit), np.float32(1e-3)))
     noise = backdrop.noise
     slope, floor = np.float32(noise.slope.mean()), np.float32(noise.floor.sum())
-    scatter = 4 * ((slope * value + floor) / value**2 + np.float32(_LEAST_TEXTURE**2 / 2))
-    showing, hidden = scatter.copy(), scatter
+    variance = (slope * value + floor) / value**2 + np.float32(_LEAST_TEXTURE**2)
+    evidence = np.zeros_like(value)
     for axis in (0, 1):
-        last = (slice(-1, None), slice(None)) if axis == 0 else (slice(None), slice(-1, None))
-        step = np.clip(np.diff(seen, axis=axis, append=seen[last]), -_STEP, _STEP)
-        showing += (step - np.diff(known, axis=axis, append=known[last])) ** 2
-        hidden += step**2
-    size = 2 * _TEXTURE_RADIUS + 1
-    window = (size, size)
-    ratio = cv2.blur(showing, window) / cv2.blur(hidden, window)
-    evidence = np.float32(size**2 / _REPEATED) * np.log(ratio)
-    return np.asarray(np.clip(evidence, -_MOST_TEXTURE, _MOST_TEXTURE), np.float32)
+        here = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
+        there = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
+        step = seen[there] - seen[here]
+        hidden, shown = step**2, (step - known[there] + known[here]) ** 2
+        # What neither explains is an edge, of a shadow or a figure.
+        weight = 1 / (1 + np.minimum(hidden, shown) / np.float32(_STEP**2))
+        said = weight * (shown - hidden) / (2 * (variance[here] + variance[there]))
+        said = np.clip(said, -_MOST_TEXTURE, _MOST_TEXTURE) / 2
+        evidence[here] += said
+        evidence[there] += said
+    return evidence
 
 
 def _leaning(hint: UInt8) -> Float32:

@@ -23,13 +23,13 @@ Places = tuple[Index, ...]
 Bool = NDArray[np.bool_]
 
 # How far the figure's colour is from that of its near part, as a part of it, and at least.
-_COLOUR, _LEAST_COLOUR = 0.1, 0.002
+_COLOUR, _LEAST_COLOUR = 0.08, 0.002
 # Once alpha is known, how far the pixel's own may be.
 _OWN_COLOUR = 0.6
 # How far β is from that of the ground around where that is even.
 _BETA = 0.02
 # Under a foot there may be shadow that is only seen so far away, rarely: exp(-the second).
-_DARKEST_RADIUS, _UNSEEN = 6, 4.0
+_DARKEST_RADIUS, _UNSEEN = 6, 2.0
 # Within so many pixels β is looked at for evenness.
 _EVEN_RADIUS = 4
 # What near parts of the figure are tried: the nearest, and those nearest to places this far off;
@@ -164,7 +164,7 @@ def _gather(
         betas.append(np.asarray(cv2.erode(behind, window)[unknown], np.float32))
         which.append(1)
         steps.append(steps[0])
-    smooth, near = _near_parts(image, solid)
+    near = _nearest(solid)
     chosen = np.stack(
         [
             near[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]
@@ -188,7 +188,7 @@ def _gather(
         shift=_by_channel(*shifts)[..., which],
         error=_by_channel(*(plates.own_variance(ground) for ground in grounds))[..., which],
         even=_unevenness(behind)[unknown][:, np.newaxis],
-        figure=np.ascontiguousarray(np.moveaxis(smooth.reshape(-1, 3)[chosen], -1, 0)),
+        figure=np.ascontiguousarray(np.moveaxis(image.reshape(-1, 3)[chosen], -1, 0)),
         far=far,
     )
 
@@ -198,18 +198,14 @@ def _by_channel(*values: Float32) -> Float32:
     return np.stack([value.T for value in values], axis=-1)
 
 
-def _near_parts(image: Float32, solid: Bool) -> tuple[Float32, Index]:
-    """The figure's colours without some of their noise, and for each pixel the place of the
-    nearest, counted row by row."""
-    weight = solid.astype(np.float32)
-    total = cv2.blur(image * weight[..., np.newaxis], (3, 3))
-    smooth = total / np.maximum(cv2.blur(weight, (3, 3)), np.float32(1e-6))[..., np.newaxis]
+def _nearest(solid: Bool) -> Index:
+    """For each pixel the place of the mask's nearest, counted row by row."""
     _, labels = cv2.distanceTransformWithLabels(
         (~solid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     places = np.zeros(int(labels.max()) + 1, np.intp)
     places[labels[solid]] = np.flatnonzero(solid)
-    return np.asarray(smooth, np.float32), np.asarray(places[labels], np.intp)
+    return np.asarray(places[labels], np.intp)
 
 
 def _unevenness(behind: Float32) -> Float32:

@@ -8,7 +8,15 @@ from numpy.typing import NDArray
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.detection import Found, changed, find_figure
 from shadowtool.core.known_background import colours, ground_beta, solve
-from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN, edge_prior, narrowed, wide_trimap
+from shadowtool.core.trimap import (
+    BACKGROUND,
+    FIGURE,
+    UNKNOWN,
+    doubted,
+    edge_prior,
+    narrowed,
+    wide_trimap,
+)
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -78,6 +86,7 @@ def pull_figure(
     first = solve(part, wide, behind, ground)
     prior = edge_prior(first.alpha, first.error, first.misfit, wide, found.mask, reach)
     narrow = narrowed(wide, prior, found.mask)
+    prior = doubted(prior, nearest.distance2)
     solved = solve(part, narrow, behind, ground, prior)
     whole = np.where(solved.alpha > 1 - _NOTHING, np.float32(1), solved.alpha)
     alpha[box] = np.where(whole < _NOTHING, np.float32(0), whole)

@@ -31,6 +31,8 @@ _LEAST_DEVIATION = 0.05
 _WINDOW, _BLURRED, _ELSEWHERE = 15, 0.75, 4.0
 _RISE = 0.6
 _BLURRED_DEVIATION = 0.3
+# What is no further from the background than this is expected to be so much less of the figure.
+_LIKE_BACKGROUND2, _DOUBT = 8.0, 0.35
 # From this mean inwards all is figure.
 _OPAQUE = 0.9
 
@@ -106,6 +108,17 @@ def edge_prior(
     loose = (trimap == UNKNOWN) & (layer < -1)
     mean[loose], deviation[loose] = 0.2, 0.4
     return Prior(mean, deviation)
+
+
+def doubted(prior: Prior, distance2: Float32) -> Prior:
+    """A prior that expects less of pixels at the edge which by themselves look like background.
+
+    Args:
+        distance2: (H, W), squared distance from the background in standard deviations.
+    """
+    doubtful = (prior.mean < _OPAQUE) & (distance2 < _LIKE_BACKGROUND2)
+    mean = np.where(doubtful, np.float32(_DOUBT) * prior.mean, prior.mean)
+    return Prior(mean, prior.deviation)
 
 
 def narrowed(trimap: UInt8, prior: Prior, mask: Bool) -> UInt8:

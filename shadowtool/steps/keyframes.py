@@ -1,11 +1,11 @@
 """Trimaps drawn for some frames of a take, and what becomes of them in the others."""
 
 from bisect import bisect_left, bisect_right
-from collections import OrderedDict
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,13 +32,13 @@ class Keyframes:
         drawn: their files.
         footage: the take.
         missing: whether frames on the way that can't be read are passed over.
+        links: between two frames, there and back.
     """
 
     drawn: Sequence
     footage: Footage
     missing: Missing
-    _links: OrderedDict[tuple[Frame, Frame], tuple[Link, Link]] = field(default_factory=OrderedDict)
-    _lock: Lock = field(default_factory=Lock)
+    links: Callable[[Frame, Frame], tuple[Link, Link]]
 
     @classmethod
     def of(cls, drawn: Sequence, footage: Footage, missing: Missing) -> "Keyframes":
@@ -50,7 +50,11 @@ class Keyframes:
                 " number the trimaps as the frames are"
             )
         require_frames(drawn, frames, footage.header, footage.sequence.pattern, missing)
-        return cls(drawn, footage, missing)
+
+        def between(here: Frame, there: Frame) -> tuple[Link, Link]:
+            return links(*(flow_picture(footage.read(frame)) for frame in (here, there)))
+
+        return cls(drawn, footage, missing, lru_cache(_KEPT)(between))
 
     def sources(self, frame: Frame) -> list[Path]:
         """What a frame's trimap is made of."""
@@ -91,16 +95,8 @@ class Keyframes:
         return True
 
     def _link(self, here: Frame, there: Frame) -> Link:
-        pair = (min(here, there), max(here, there))
-        with self._lock:
-            found = self._links.get(pair)
-        if found is None:
-            found = links(*(flow_picture(self.footage.read(frame)) for frame in pair))
-            with self._lock:
-                self._links[pair] = found
-                while len(self._links) > _KEPT:
-                    self._links.popitem(last=False)
-        return found[0] if here == pair[0] else found[1]
+        there_and_back = self.links(min(here, there), max(here, there))
+        return there_and_back[0] if here < there else there_and_back[1]
 
 
 def trimap_of(path: Path) -> UInt8:

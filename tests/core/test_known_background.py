@@ -26,15 +26,15 @@ def searched(
 ) -> tuple[float, float]:
     """The most probable alpha and β of one pixel: every pair tried in turn.
 
-    β is counted from what is expected, and spread by 0.03.
+    β is counted from what is expected, and spread by 0.02.
     """
     alphas, betas = np.meshgrid(np.linspace(0, 1, 1001), np.linspace(-0.2, 0.2, 401), indexing="ij")
     mixed = alphas[..., None] * figure + (1 - alphas[..., None]) * (
         ground + betas[..., None] * shift
     )
-    variance = NOISE.sigma(seen) ** 2 + (alphas[..., None] * (0.1 * figure + 0.002)) ** 2
+    variance = NOISE.sigma(seen) ** 2 + (alphas[..., None] * (0.08 * figure + 0.002)) ** 2
     variance = variance + ((1 - alphas[..., None]) * 0.01 * ground) ** 2
-    cost = ((seen - mixed) ** 2 / variance).sum(axis=-1) + (betas / 0.03) ** 2
+    cost = ((seen - mixed) ** 2 / variance).sum(axis=-1) + (betas / 0.02) ** 2
     best = np.unravel_index(np.argmin(cost), cost.shape)
     return float(alphas[best]), float(betas[best])
 

@@ -6,6 +6,7 @@ from shadowtool.core.trimap import (
     FIGURE,
     UNKNOWN,
     Prior,
+    doubted,
     edge_prior,
     narrowed,
     wide_trimap,
@@ -93,3 +94,11 @@ def test_another_colour_at_the_rim_is_not_taken_for_blur() -> None:
     mask = alpha > 0.5
     trimap, prior = prior_of(found, mask)
     assert (narrowed(trimap, prior, mask)[disk(80, 50, 23) == 1] == FIGURE).mean() > 0.97
+
+
+def test_less_is_expected_at_the_edge_of_what_looks_like_the_ground() -> None:
+    prior = Prior(np.float32([0.8, 0.8, 1.0, 0.0]), np.full(4, 0.1, np.float32))
+    found = doubted(prior, np.float32([1, 100, 1, 1]))
+    assert found.mean[0] < 0.5
+    assert np.array_equal(found.mean[1:], prior.mean[1:])
+    assert np.array_equal(found.deviation, prior.deviation)

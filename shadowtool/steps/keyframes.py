@@ -20,8 +20,8 @@ from shadowtool.steps.footage import Footage, require_frames
 
 UInt8 = NDArray[np.uint8]
 
-# So many links are kept for the frames that need them next.
-_KEPT = 24
+# From further away nothing comes through, and no more links are kept for the next frames.
+_FURTHEST = 24
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Keyframes:
         def between(here: Frame, there: Frame) -> tuple[Link, Link]:
             return links(*(flow_picture(footage.read(frame)) for frame in (here, there)))
 
-        return cls(drawn, footage, missing, lru_cache(_KEPT)(between))
+        return cls(drawn, footage, missing, lru_cache(_FURTHEST)(between))
 
     def sources(self, frame: Frame) -> list[Path]:
         """What a frame's trimap is made of."""
@@ -64,16 +64,21 @@ class Keyframes:
         return files
 
     def trimap(self, frame: Frame) -> UInt8:
-        """A frame's trimap, (H, W) uint8: as drawn, or carried from the keyframes beside it."""
+        """A frame's trimap, (H, W) uint8: as drawn, or carried from the keyframes beside it; all
+        unknown if they are too far away."""
         sides = [self._carried(frame, key) for key in self._keys(frame)]
+        if not sides:
+            width, height = self.footage.header.size
+            return np.full((height, width), UNKNOWN, np.uint8)
         return merge(sides)
 
     def _keys(self, frame: Frame) -> list[Frame]:
-        """The keyframe itself, or those before and after."""
+        """The keyframe itself, or those before and after that are near enough."""
         keys = sorted(key for key in self.drawn.files if key in self.footage.sequence.files)
         before = keys[: bisect_right(keys, frame)][-1:]
         after = keys[bisect_left(keys, frame) :][:1]
-        return before if before == after else before + after
+        keys = before if before == after else before + after
+        return [key for key in keys if len(self._way(frame, key)) <= _FURTHEST + 1]
 
     def _way(self, frame: Frame, key: Frame) -> list[Frame]:
         """The take's frames from one to a keyframe, both included."""

@@ -117,6 +117,20 @@ def test_keyframes_give_the_same_bits_whatever_the_jobs_and_the_split(
         assert tree(parts / folder) == tree(whole / folder)
 
 
+def test_frames_far_from_any_keyframe_do_without(
+    pull: Callable[..., Path],
+    take: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("shadowtool.steps.keyframes._FURTHEST", 1)
+    out, free = pull("out", trimap=take / "trimaps"), pull("free")
+    for number in (1004, 1005):
+        one, other = (
+            read_image(folder / "fg" / f"fg.{number}.exr").layers["RGBA"] for folder in (out, free)
+        )
+        assert np.array_equal(one, other)
+
+
 def test_an_edge_of_a_given_alpha_is_coloured_without_the_ground(
     pull: Callable[..., Path], tmp_path: Path
 ) -> None:

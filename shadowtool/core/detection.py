@@ -48,7 +48,7 @@ class Found(NamedTuple):
     """A figure in a frame.
 
     Attributes:
-        mask: (H, W) bool, most of the pixel shows the figure.
+        mask: (H, W) bool, most of the pixel shows the figure; nothing thin.
         maybe: (H, W) bool, mask and what hangs on it that is not background, strands above all.
     """
 
@@ -103,8 +103,10 @@ def find_figure(
     if (error > 1).any():
         distance2 = distance2 / error**2
         mask = mask_of(distance2)
+    # What is thinner than three pixels is no limb.
+    limbs = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
     strands = (distance2 > _OFF_LINE2) & (nearest.from_lit2 > _OFF_LINE2) & ~unknown
-    return Found(mask, _connected(mask | strands, mask))
+    return Found(limbs, _connected(mask | strands, limbs))
 
 
 def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:

@@ -33,6 +33,8 @@ _RISE = 0.6
 _BLURRED_DEVIATION = 0.3
 # What is no further from the background than this is expected to be so much less of the figure.
 _LIKE_BACKGROUND2, _DOUBT = 8.0, 0.35
+# Of what hangs loosely on a figure little is expected, which hair is exact enough to overcome.
+_LOOSE = (0.1, 0.25)
 # From this mean inwards all is figure.
 _OPAQUE = 0.9
 
@@ -106,7 +108,7 @@ def edge_prior(
         mean[blurred] = found[blurred]
         deviation[blurred] = _BLURRED_DEVIATION
     loose = (trimap == UNKNOWN) & (layer < -1)
-    mean[loose], deviation[loose] = 0.2, 0.4
+    mean[loose], deviation[loose] = _LOOSE
     return Prior(mean, deviation)
 
 

@@ -56,7 +56,7 @@ def test_what_may_be_figure_is_in_the_band_and_little_is_expected_of_it() -> Non
     trimap = wide_trimap(alpha > 0.5, maybe | (alpha > 0.5), REACH)
     assert (trimap[50, 110:145] == UNKNOWN).all()
     prior = edge_prior(alpha.astype(np.float32), EXACT, EXACT, trimap, alpha > 0.5, REACH)
-    assert prior.mean[50, 120] < 0.3 < prior.deviation[50, 120]
+    assert prior.mean[50, 120] < 0.2 < prior.deviation[50, 120]
 
 
 def test_a_sharp_edge_makes_a_band_of_its_own_width() -> None:

@@ -6,6 +6,7 @@ around, give or take. For each of several near parts the most probable α and β
 averaged by how well each explains the pixel.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import cv2
@@ -36,6 +37,7 @@ _EVEN_RADIUS = 4
 # one at this distance counts less by exp(-1/2).
 _AROUND, _FAR = 3.0, 6.0
 _ROUNDS = 2
+_BLOCK = 1 << 16
 
 
 class Solved(NamedTuple):
@@ -86,19 +88,18 @@ def solve(
     alpha = np.where(trimap == FIGURE, np.float32(1), np.float32(0))
     foreground = image * alpha[..., np.newaxis]
     error, misfit = np.zeros_like(alpha), np.zeros_like(alpha)
-    unknown = np.nonzero(trimap == UNKNOWN)
-    if alpha.any() and unknown[0].size:
-        mean = np.full(unknown[0].shape, 0.5, np.float32)
-        deviation = np.full(unknown[0].shape, 3, np.float32)
+    solid = trimap == FIGURE
+    if not solid.any():
+        return Solved(alpha, foreground, error, misfit)
+    for part in _blocks(trimap == UNKNOWN):
+        mean = np.full(part[0].shape, 0.5, np.float32)
+        deviation = np.full(part[0].shape, 3, np.float32)
         if prior is not None:
-            mean, deviation = prior.mean[unknown], prior.deviation[unknown]
-        pixels = _gather(
-            image, trimap == FIGURE, unknown, behind, backdrop, darkest=prior is not None
-        )
-        result = _most_probable(pixels, mean, deviation)
-        alpha[unknown], error[unknown], misfit[unknown] = result[:3]
-        foreground[unknown] = _colour(pixels, result[0], result[1], result[3]).T
-    return Solved(alpha, foreground, error, misfit)
+            mean, deviation = prior.mean[part], prior.deviation[part]
+        pixels = _gather(image, solid, part, behind, backdrop, darkest=prior is not None)
+        alpha[part], error[part], misfit[part], share = _most_probable(pixels, mean, deviation)
+        foreground[part] = _colour(pixels, alpha[part], error[part], share).T
+    return Solved(alpha, np.maximum(foreground, 0), error, misfit)
 
 
 def colours(image: Float32, alpha: Float32, behind: Float32, backdrop: Backdrop) -> Float32:
@@ -111,13 +112,19 @@ def colours(image: Float32, alpha: Float32, behind: Float32, backdrop: Backdrop)
     """
     solid = alpha >= min(0.99, float(alpha.max()))
     foreground = np.where((solid & (alpha > 0))[..., np.newaxis], image, np.float32(0))
-    unknown = np.nonzero((alpha > 0) & ~solid)
-    if unknown[0].size:
-        pixels = _gather(image, solid, unknown, behind, backdrop, darkest=True)
-        given = alpha[unknown]
-        result = _most_probable(pixels, given, np.full(given.shape, 1e-3, np.float32))
-        foreground[unknown] = _colour(pixels, given, np.zeros_like(given), result[3]).T
+    for part in _blocks((alpha > 0) & ~solid):
+        pixels = _gather(image, solid, part, behind, backdrop, darkest=True)
+        given = alpha[part]
+        *_, share = _most_probable(pixels, given, np.full(given.shape, 1e-3, np.float32))
+        foreground[part] = _colour(pixels, given, np.zeros_like(given), share).T
     return np.maximum(foreground, 0)
+
+
+def _blocks(mask: Bool) -> Iterator[Places]:
+    """The mask's pixels, so many at a time that memory stays bounded."""
+    rows, columns = np.nonzero(mask)
+    for start in range(0, rows.size, _BLOCK):
+        yield rows[start : start + _BLOCK], columns[start : start + _BLOCK]
 
 
 class _Pixels(NamedTuple):

@@ -68,6 +68,16 @@ def test_alpha_in_light_in_shadow_and_across_its_edge(beta: np.ndarray | None) -
     assert (found.alpha[trimap == BACKGROUND] == 0).all()
 
 
+def test_many_pixels_are_solved_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = shot(DISK, SHADE)
+    trimap = trimap_of(DISK)
+    whole = solve(given.image, trimap, behind(given, trimap), BACKDROP)
+    monkeypatch.setattr("shadowtool.core.known_background._BLOCK", 7)
+    parts = solve(given.image, trimap, behind(given, trimap), BACKDROP)
+    for one, other in zip(whole, parts, strict=True):
+        assert one == pytest.approx(other, abs=1e-5)
+
+
 def test_the_error_that_it_predicts_is_the_one_it_makes() -> None:
     given = shot(DISK, SHADE)
     trimap = trimap_of(DISK)

@@ -12,8 +12,8 @@ from tests.scene import Scene
 SCENE = Scene(100, 160, rows=(0, 0), columns=(0, 0))
 # That of `Scene.noisy`.
 NOISE = NoiseModel(np.full(3, 5e-5), np.full(3, 5e-7))
-BACKDROP = Backdrop(SCENE.lit, SCENE.shadow, NOISE)
 KNOWN = np.zeros(SCENE.lit.shape[:2], bool)
+BACKDROP = Backdrop(SCENE.lit, SCENE.shadow, NOISE, KNOWN.astype(np.float32))
 ROWS, COLUMNS = np.mgrid[: SCENE.height, : SCENE.width].astype(float)
 BLUE, DARK = np.float32([0.05, 0.1, 0.6]), np.float32([0.02, 0.02, 0.03])
 # Exposures of a moving figure that make up its blur.

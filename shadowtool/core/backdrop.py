@@ -42,15 +42,17 @@ class Backdrop:
     Attributes:
         lit, shadow: (H, W, 3) float32, linear light, without NaN; or any pixels of it, (..., 3).
         noise: the take's.
+        doubt: (H, W) float32, by how much S may be off besides, as a part of it.
     """
 
     lit: Float32
     shadow: Float32
     noise: NoiseModel
+    doubt: Float32
 
     def at(self, places: Places) -> "Backdrop":
         """Some of its pixels, by their rows and columns."""
-        return Backdrop(self.lit[places], self.shadow[places], self.noise)
+        return Backdrop(self.lit[places], self.shadow[places], self.noise, self.doubt[places])
 
     def under(self, beta: Float32) -> Float32:
         """What is seen under β, (..., 3); below 0 what is darker than S."""
@@ -69,8 +71,10 @@ class Backdrop:
         return np.asarray(np.maximum(image, 0) * np.float32(slope) + np.float32(floor), np.float32)
 
     def own_variance(self, image: Float32) -> Float32:
-        """Of plates at these values, (..., 3)."""
-        return np.asarray((np.float32(_TOLERANCE) * np.maximum(image, 0)) ** 2, np.float32)
+        """Of the plates at these values, (..., 3)."""
+        value = np.maximum(image, 0)
+        doubtful = self.doubt[..., np.newaxis] * np.minimum(value, self.shadow)
+        return np.asarray((np.float32(_TOLERANCE) * value) ** 2 + doubtful**2, np.float32)
 
     def from_lit2(self, image: Float32) -> Float32:
         """Squared distance from L in standard deviations, (H, W)."""

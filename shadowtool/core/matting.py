@@ -27,6 +27,8 @@ Box = tuple[slice, slice]
 _REACH, _REACH_PART = 4, 1 / 240
 # So much of the surroundings is worked on too, pixels.
 _MARGIN = 16
+# From this alpha on the ground behind is not told by what is seen past the figure.
+HIDDEN = 0.5
 # Alpha as near as this to 0 or 1 is noise.
 _NOTHING = 0.01
 
@@ -114,6 +116,16 @@ def colour_figure(image: Float32, backdrop: Backdrop, unknown: Bool, alpha: Floa
         foreground[box] = alpha[box][..., np.newaxis] * colours(part, alpha[box], behind, ground)
         foreground[bad] = 0
     return Figure(foreground, alpha, np.asarray(trimap, np.uint8))
+
+
+def without_figure(image: Float32, figure: Figure) -> Float32:
+    """The ground that is seen past a figure's edge, (C - αF) / (1 - α); the frame where there is no
+    figure, or where it hides the ground."""
+    edge = (figure.alpha > 0) & (figure.alpha < HIDDEN)
+    ground = image.copy()
+    left = 1 - figure.alpha[edge][:, np.newaxis]
+    ground[edge] = (image[edge] - figure.foreground[edge]) / left
+    return ground
 
 
 def _without_unknown(

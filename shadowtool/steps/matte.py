@@ -13,7 +13,7 @@ from shadowtool.core import beta as shadow_beta
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.exposure import frame_gain, without_gain
 from shadowtool.core.holdout import grid_step, on_grid
-from shadowtool.core.matting import Figure, colour_figure, pull_figure
+from shadowtool.core.matting import HIDDEN, Figure, colour_figure, pull_figure, without_figure
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.plates import Plates
 from shadowtool.errors import OptionError
@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
+# By how much a shadow plate may be off where no frame showed full shadow.
+_GUESSED = 0.04
 # A figure larger than this part of the picture is none.
 _TOO_MUCH = 0.5
 
@@ -173,7 +175,10 @@ class _Scene:
         )
         step = grid_step(*header.size)
         reference = on_grid(lit, step)
-        backdrop = Backdrop(lit, shadow, noise)
+        doubt = np.zeros(contrast.shape, np.float32)
+        if plates.shadow_frames is not None:
+            doubt[plates.shadow_frames == 0] = _GUESSED
+        backdrop = Backdrop(lit, shadow, noise, doubt)
         return cls(plates, backdrop, unknown, never_shaded, contrasts, confidence, step, reference)
 
 
@@ -218,8 +223,9 @@ class _Take:
             write_png(self._file("trimap", frame), figure.trimap, provenance)
         if self.wanted == ("trimap",):
             return {}
-        hidden = figure.alpha > 0
-        beta, unknown = self._beta(shown.image, hidden)
+        ground = without_figure(shown.image, figure)
+        hidden = figure.alpha >= HIDDEN
+        beta, unknown = self._beta(ground, hidden)
         figures: Figures = {
             "unknown": int((unknown & ~hidden).sum()),
             "hidden": int(hidden.sum()),
@@ -232,7 +238,8 @@ class _Take:
             rgba[..., :3], rgba[..., 3] = to_half(figure.foreground), to_half(figure.alpha)
             write_exr(self._file("alpha", frame), {"RGBA": rgba}, shown.header, marked)
         if "beta" in self.wanted:
-            confidence = np.where(unknown, np.float32(0), self.scene.confidence)
+            confidence = self.scene.confidence * (1 - figure.alpha)
+            confidence[unknown] = 0
             name = "Y" if self.beta == "scalar" else "RGB"
             layers = {name: to_half(beta), "confidence": to_half(confidence)}
             write_exr(self._file("beta", frame), layers, shown.header, marked)

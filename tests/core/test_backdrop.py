@@ -59,3 +59,14 @@ def test_noise_alone_is_as_far_from_the_line_as_noise_is() -> None:
 def test_the_distance_from_light_is_the_same_by_itself() -> None:
     image = SCENE.noisy(SCENE.image(SCENE.disk(50, 40)), 4)
     assert BACKDROP.from_lit2(image) == pytest.approx(BACKDROP.nearest(image).from_lit2, rel=1e-4)
+
+
+def test_a_shadow_plate_that_is_only_guessed_is_held_to_less() -> None:
+    doubt = np.full(SCENE.lit.shape[:2], 0.05, np.float32)
+    guessed = Backdrop(SCENE.lit, SCENE.shadow, BACKDROP.noise, doubt)
+    other_hue = SCENE.shadow * np.float32([1.05, 1, 0.95])
+    sure, unsure = BACKDROP.nearest(other_hue), guessed.nearest(other_hue)
+    assert np.median(unsure.distance2) < 0.5 * np.median(sure.distance2)
+    # It makes little difference in the light.
+    lit = SCENE.lit * np.float32([1.05, 1, 0.95])
+    assert (guessed.nearest(lit).distance2 > 0.55 * BACKDROP.nearest(lit).distance2).all()

@@ -73,7 +73,7 @@ def test_pixels_of_which_nothing_is_known_follow_their_neighbours() -> None:
 
 def test_a_hint_decides_where_the_frame_says_nothing_and_nowhere_else() -> None:
     even = np.full_like(SCENE.lit, 0.5)
-    backdrop = Backdrop(even, even / 4, BACKDROP.noise)
+    backdrop = Backdrop(even, even / 4, BACKDROP.noise, BACKDROP.doubt)
     figure, hole = disk(60, 50, 20) > 0, disk(60, 50, 8) > 0
     image = np.where(figure[..., None] & ~hole[..., None], np.float32([0.1, 0.2, 0.6]), even)
     hint = np.where(figure, FIGURE, BACKGROUND)
@@ -105,7 +105,7 @@ def test_the_edges_of_a_shadow_say_nothing_of_texture() -> None:
 
 def test_ground_without_texture_says_nothing() -> None:
     even = np.full_like(SCENE.lit, 0.5)
-    evidence = texture_evidence(even, Backdrop(even, even / 4, BACKDROP.noise))
+    evidence = texture_evidence(even, Backdrop(even, even / 4, BACKDROP.noise, BACKDROP.doubt))
     assert evidence == pytest.approx(0, abs=1e-4)
 
 

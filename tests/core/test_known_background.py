@@ -90,7 +90,7 @@ def test_the_error_that_it_predicts_is_the_one_it_makes() -> None:
 def test_a_prior_decides_where_the_figure_looks_like_the_ground() -> None:
     ground = SCENE.lit.mean(axis=(0, 1))
     even = SCENE.lit * 0 + ground
-    backdrop = type(BACKDROP)(even, even / 4, NOISE)
+    backdrop = type(BACKDROP)(even, even / 4, NOISE, BACKDROP.doubt)
     trimap = trimap_of(DISK)
     ones = np.ones_like(SHADE)
     for expected in (0.2, 0.9):

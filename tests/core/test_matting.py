@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from shadowtool.core.matting import Figure, colour_figure, pull_figure
+from shadowtool.core.matting import (
+    HIDDEN,
+    Figure,
+    colour_figure,
+    pull_figure,
+    without_figure,
+)
 from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
 from tests.figures import (
     BACKDROP,
@@ -150,3 +156,13 @@ def test_the_same_frame_gives_the_same_bits() -> None:
     given = shot(DISK, FOOT)
     for one, other in zip(pulled(given), pulled(given), strict=True):
         assert np.array_equal(one, other)
+
+
+def test_past_an_edge_the_ground_is_seen() -> None:
+    given = shot(DISK, FOOT, noise=0)
+    true = Figure(DISK[..., None] * given.foreground, given.alpha, np.zeros(KNOWN.shape, np.uint8))
+    seen = given.alpha < HIDDEN
+    assert without_figure(given.image, true)[seen] == pytest.approx(
+        given.background[seen], abs=1e-4
+    )
+    assert np.array_equal(without_figure(given.image, true)[~seen], given.image[~seen])

@@ -20,6 +20,7 @@ test: .venv/installed-dev
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.benchmarks.footage
 	$(BIN)/python -m tests.benchmarks.plates
+	$(BIN)/python -m tests.benchmarks.matting
 	$(BIN)/python -m tests.benchmarks.warp
 	$(BIN)/python -m tests.benchmarks.composite
 
@@ -36,7 +37,7 @@ format: .venv/installed-dev
 	$(BIN)/ruff format .
 
 .venv/installed-bench: pyproject.toml | .venv/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev,sample]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev,sample,bench]"
 	touch $@ .venv/installed-dev .venv/installed
 
 # The README's reference of the commands, from their own --help.

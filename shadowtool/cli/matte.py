@@ -12,8 +12,17 @@ from shadowtool.cli.options import folder_option, gain_option, step_command, tra
 @click.command()
 @click.argument("source", metavar="FRAMES")
 @folder_option("--plates", "plates", "Plates of this scene, from plate.", required=True)
-@click.option("--trimap", metavar="FRAMES", help="Trimaps (0, 128, 255) instead of our own.")
-@click.option("--alpha", metavar="FRAMES", help="The figure's matte, used as it is given.")
+@click.option(
+    "--trimap",
+    metavar="FRAMES",
+    help="Trimaps (0, 128, 255) drawn for any of the frames. There they decide; in the frames"
+    " between, carried by optical flow, they decide what colours leave open.",
+)
+@click.option(
+    "--alpha",
+    metavar="FRAMES",
+    help="The figure's matte, used as it is given; its colour is still solved.",
+)
 @click.option("--only", type=click.Choice(ONLY), help="Write one product and stop.")
 @click.option(
     "--beta",

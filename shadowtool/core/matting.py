@@ -1,150 +1,159 @@
-"""The figure's matte and colour in front of a background that is known but for its shadow.
-
-Behind each pixel of the figure lies βL + (1 - β)S with one unknown β: a line in colour space. What
-does not lie on the line is the figure.
-"""
+"""The figure's matte and colour in a frame whose background is known but for its shadow."""
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.color_line import line_distance
-from shadowtool.core.noise import NoiseModel
+from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.detection import Found, changed, find_figure
+from shadowtool.core.known_background import colours, ground_beta, solve
+from shadowtool.core.trimap import (
+    BACKGROUND,
+    FIGURE,
+    UNKNOWN,
+    doubted,
+    edge_prior,
+    narrowed,
+    wide_trimap,
+)
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+Box = tuple[slice, slice]
 
-BACKGROUND, UNKNOWN, FIGURE = np.uint8(0), np.uint8(128), np.uint8(255)
-
-# Distances from the line, in standard deviations of its noise, at which a pixel starts to be, and
-# surely is, something else than background.
-_BACKGROUND_DISTANCE = 4.0
-_FIGURE_DISTANCE = 12.0
-# How exact plates are, as a part of their value.
-_TOLERANCE = 0.015
-# How much of the sky is left in the shadow near the foot of a figure.
-_DEEPEST = 0.75
-# Ground is in shadow below this β. Something dark borders on lit ground if no more than this part
-# of the ground within so many pixels of it is in shadow.
-_HALF_SHADE, _LIT_BORDER, _RING = 0.5, 0.2, 3
+# Edges are looked for this far inwards: pixels, and of wide pictures a part of their width.
+_REACH, _REACH_PART = 4, 1 / 240
+# So much of the surroundings is worked on too, pixels.
+_MARGIN = 16
+# From this alpha on the ground behind is not told by what is seen past the figure.
+HIDDEN = 0.5
+# Alpha as near as this to 0 or 1 is noise.
+_NOTHING = 0.01
 
 
 class Figure(NamedTuple):
-    """The figure alone: `foreground` (H, W, 3) premultiplied by `alpha` (H, W), float32."""
+    """The figure alone.
+
+    Attributes:
+        foreground: (H, W, 3) float32 ≥ 0, premultiplied.
+        alpha: (H, W) float32 in [0, 1].
+        trimap: (H, W) uint8: 0 background, 128 unknown, 255 figure.
+    """
 
     foreground: Float32
     alpha: Float32
+    trimap: UInt8
 
 
-def figure_distance(
-    image: Float32, beta: Float32, lit: Float32, shadow: Float32, noise: NoiseModel
-) -> Float32:
-    """How far each pixel is from all that the background can look like, in standard deviations.
-
-    Near its feet a figure takes some of the sky away from its shadow, which is then a little darker
-    than S; and dark clothes look like such a shadow. What is darker than S counts as shadow where
-    it borders on shadow, and as figure where the ground around it is lit.
-
-    Args:
-        image, lit, shadow: (H, W, 3), linear light.
-        beta: (H, W), not clipped.
-
-    Returns:
-        (H, W) float32 ≥ 0.
-    """
-    strict = line_distance(image, lit, shadow, noise, _TOLERANCE)
-    deeper = line_distance(image, shadow, np.float32(_DEEPEST) * shadow, noise, _TOLERANCE)
-    distance = np.minimum(strict, deeper)
-    doubtful = ((strict > _BACKGROUND_DISTANCE) & (deeper < strict)).astype(np.uint8)
-    small = np.ones((3, 3), np.uint8)
-    doubtful = cv2.morphologyEx(doubtful, cv2.MORPH_OPEN, small).astype(np.uint8)
-    ground = strict <= _BACKGROUND_DISTANCE
-    shaded = ground & (beta < _HALF_SHADE)
-    height, width = distance.shape
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(doubtful, connectivity=8)
-    for label, (x, y, w, h, _) in enumerate(boxes.tolist()[1:], start=1):
-        part = (
-            slice(max(y - _RING, 0), min(y + h + _RING, height)),
-            slice(max(x - _RING, 0), min(x + w + _RING, width)),
-        )
-        own = (labels[part] == label).astype(np.uint8)
-        size = 2 * _RING + 1
-        around = (cv2.dilate(own, np.ones((size, size), np.uint8)) > 0) & (own == 0)
-        ground_around = (around & ground[part]).sum()
-        if (around & shaded[part]).sum() <= _LIT_BORDER * ground_around:
-            np.copyto(distance[part], strict[part], where=own > 0)
-    return np.asarray(distance, np.float32)
-
-
-def difference_trimap(distance: Float32, band: int = 3) -> UInt8:
-    """A trimap by difference.
+def pull_figure(
+    image: Float32,
+    backdrop: Backdrop,
+    unknown: Bool,
+    drawn: UInt8 | None = None,
+    hint: UInt8 | None = None,
+) -> Figure:
+    """The figure in a frame, its alpha, colour and trimap.
 
     Args:
-        distance: (H, W) from `figure_distance`.
-        band: half the width of the unknown band, pixels.
+        image: (H, W, 3) float32, linear light; where it is not finite it is unknown.
+        unknown: (H, W), the plates say nothing of the pixel.
+        drawn: (H, W) uint8, a trimap from elsewhere whose 0 and 255 are kept; what is 128 in it is
+            found as without one.
+        hint: (H, W) uint8, a trimap that may be a little off, for what the frame leaves open.
 
     Returns:
-        (H, W) uint8: 0 background, 128 unknown, 255 figure.
+        The figure; empty if there is none, black where the frame is unknown.
     """
-    # A single noisy pixel is no figure, a whole neighbourhood off the line is.
-    smooth = cv2.GaussianBlur(np.minimum(distance, 3 * _FIGURE_DISTANCE), (0, 0), 1.0)
-    figure = (smooth > _FIGURE_DISTANCE / 2).astype(np.uint8)
-    small = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
-    figure = cv2.morphologyEx(figure, cv2.MORPH_OPEN, small).astype(np.uint8)
-    closing = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
-    figure = cv2.morphologyEx(figure, cv2.MORPH_CLOSE, closing).astype(np.uint8)
-    figure = _without_specks(figure)
-    edge = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
-    trimap = np.full(figure.shape, UNKNOWN, np.uint8)
-    trimap[cv2.erode(figure, edge) > 0] = FIGURE
-    trimap[cv2.dilate(figure, edge) == 0] = BACKGROUND
-    return trimap
+    height, width = image.shape[:2]
+    alpha = np.zeros((height, width), np.float32)
+    foreground = np.zeros((height, width, 3), np.float32)
+    if drawn is None:
+        drawn = np.full((height, width), UNKNOWN, np.uint8)
+    trimap = np.where(drawn == FIGURE, FIGURE, BACKGROUND)
+    seen, unknown, bad = _without_unknown(image, backdrop, unknown)
+    box = _around(changed(seen, backdrop) | (trimap == FIGURE))
+    if box is None:
+        return Figure(foreground, alpha, trimap)
+    reach = max(_REACH, round(_REACH_PART * width))
+    part, ground = seen[box], backdrop.at(box)
+    nearest = ground.nearest(part)
+    hint = drawn if hint is None else hint
+    found = find_figure(part, ground, nearest, unknown[box], hint[box], height * width)
+    found = _within(found, drawn[box])
+    wide = wide_trimap(found.mask, found.maybe, reach)
+    wide = np.where(drawn[box] == UNKNOWN, wide, drawn[box])
+    behind = ground_beta(nearest.beta, (wide == BACKGROUND) & ~unknown[box])
+    first = solve(part, wide, behind, ground)
+    prior = edge_prior(first.alpha, first.error, first.misfit, wide, found.mask, reach)
+    narrow = narrowed(wide, prior, found.mask)
+    prior = doubted(prior, nearest.distance2)
+    solved = solve(part, narrow, behind, ground, prior)
+    whole = np.where(solved.alpha > 1 - _NOTHING, np.float32(1), solved.alpha)
+    alpha[box] = np.where(whole < _NOTHING, np.float32(0), whole)
+    foreground[box] = alpha[box][..., np.newaxis] * solved.foreground
+    foreground[bad] = 0
+    trimap[box] = narrow
+    return Figure(foreground, alpha, trimap)
 
 
-def difference_alpha(distance: Float32, trimap: UInt8) -> Float32:
-    """Alpha by difference: 0 on the line between L and S, 1 far from it.
+def colour_figure(image: Float32, backdrop: Backdrop, unknown: Bool, alpha: Float32) -> Figure:
+    """The colour of a figure whose alpha is given; arguments and result as for `pull_figure`.
 
     Args:
-        distance: (H, W) from `figure_distance`.
-        trimap: (H, W) uint8; 0 and 255 are kept as they are.
-
-    Returns:
-        (H, W) float32 in [0, 1].
+        alpha: (H, W) float32 in [0, 1], kept as it is.
     """
-    smooth = cv2.GaussianBlur(distance, (0, 0), 0.7)
-    alpha = np.clip(
-        (smooth - _BACKGROUND_DISTANCE) / (_FIGURE_DISTANCE - _BACKGROUND_DISTANCE), 0, 1
-    )
-    alpha[trimap == BACKGROUND] = 0
-    alpha[trimap == FIGURE] = 1
-    return np.asarray(alpha, np.float32)
+    height, width = alpha.shape
+    foreground = np.zeros((height, width, 3), np.float32)
+    trimap = np.where(alpha >= 1, FIGURE, np.where(alpha > 0, UNKNOWN, BACKGROUND))
+    box = _around(alpha > 0)
+    if box is not None:
+        seen, unknown, bad = _without_unknown(image, backdrop, unknown)
+        part, ground = seen[box], backdrop.at(box)
+        seen_ground = (alpha[box] == 0) & ~unknown[box]
+        behind = ground_beta(ground.nearest(part).beta, seen_ground)
+        foreground[box] = alpha[box][..., np.newaxis] * colours(part, alpha[box], behind, ground)
+        foreground[bad] = 0
+    return Figure(foreground, alpha, np.asarray(trimap, np.uint8))
 
 
-def pull_figure(image: Float32, alpha: Float32, background: Float32) -> Figure:
-    """The figure's premultiplied colour, Eq. (1): αF = C - (1 - α)B.
-
-    Args:
-        image: (H, W, 3) float32, linear light.
-        alpha: (H, W) float32 in [0, 1].
-        background: (H, W, 3), βL + (1 - β)S; NaN counts as black.
-
-    Returns:
-        The figure; its colour is at least 0, and 0 where alpha or the picture is unknown.
-    """
-    foreground = np.nan_to_num(image) - (1 - alpha[..., None]) * np.nan_to_num(background)
-    foreground[alpha == 0] = 0
-    return Figure(np.maximum(foreground, 0).astype(np.float32), alpha)
+def without_figure(image: Float32, figure: Figure) -> Float32:
+    """The ground that is seen past a figure's edge, (C - αF) / (1 - α); the frame where there is no
+    figure, or where it hides the ground."""
+    edge = (figure.alpha > 0) & (figure.alpha < HIDDEN)
+    ground = image.copy()
+    left = 1 - figure.alpha[edge][:, np.newaxis]
+    ground[edge] = (image[edge] - figure.foreground[edge]) / left
+    return ground
 
 
-def _without_specks(mask: UInt8) -> UInt8:
-    """Drop parts smaller than 1/5000 of the frame, close holes of that size."""
-    least = mask.size / 5000
-    for value in (1, 0):
-        part = (mask == value).astype(np.uint8)
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
-        small = stats[:, cv2.CC_STAT_AREA] < least
-        small[0] = False
-        mask = np.where(small[labels], np.uint8(1 - value), mask)
-    return mask
+def _without_unknown(
+    image: Float32, backdrop: Backdrop, unknown: Bool
+) -> tuple[Float32, Bool, Bool]:
+    """The frame with lit ground in place of what is unknown of it; what is unknown of either, and
+    of the frame."""
+    # By channel: to reduce an axis of three is slow.
+    finite = np.isfinite(image)
+    bad = ~(finite[..., 0] & finite[..., 1] & finite[..., 2])
+    if not bad.any():
+        return image, unknown, bad
+    return np.where(bad[..., np.newaxis], backdrop.lit, image), unknown | bad, bad
+
+
+def _around(mask: Bool) -> Box | None:
+    """The rows and columns of a mask with a margin; None if it is empty."""
+    bounds = []
+    for axis, size in ((1, mask.shape[0]), (0, mask.shape[1])):
+        places = np.flatnonzero(mask.any(axis=axis))
+        if not places.size:
+            return None
+        first, last = int(places[0]), int(places[-1])
+        bounds.append(slice(max(first - _MARGIN, 0), min(last + _MARGIN + 1, size)))
+    return bounds[0], bounds[1]
+
+
+def _within(found: Found, drawn: UInt8) -> Found:
+    """What was found, as far as a drawn trimap leaves it open."""
+    mask = (drawn == FIGURE) | ((drawn == UNKNOWN) & found.mask)
+    return Found(mask, mask | ((drawn == UNKNOWN) & found.maybe))

@@ -21,6 +21,8 @@ _NEAR, _FAR = (0.5, 0.6744898), (0.3, 0.3853205)
 # Of normal noise 8% of the differences are below a tenth of a standard deviation. A codec repeats
 # pixels if more than this part is.
 _FROZEN = 0.2
+# Noise is as large as a code value, give or take this logarithm.
+_ONE_CODE = 0.7
 _LEVELS = 12
 _GRID = 10_000
 _SAMPLES = 8
@@ -131,9 +133,10 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
     if not measured:
         return []
     values, sigmas, frozen, steps = np.median(measured, axis=0)
-    if np.median(frozen) > _FROZEN and (
-        distant := _spreads([(samples[a], samples[b]) for a, b in far], _FAR)
-    ):
+    # Where noise spans about one code value, rounding makes many differences nothing.
+    codes = np.abs(np.log(np.maximum(steps, 1e-12) / np.maximum(sigmas, 1e-12)))
+    repeated = np.median(frozen) > _FROZEN and (codes > _ONE_CODE).any()
+    if repeated and (distant := _spreads([(samples[a], samples[b]) for a, b in far], _FAR)):
         values, sigmas, _, steps = np.quantile(distant, _FAR_QUANTILE, axis=0)
     # Noise that rounding to code values hides is as large as the rounding.
     sigmas = np.sqrt(sigmas**2 + steps**2 / 12)

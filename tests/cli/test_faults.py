@@ -220,10 +220,15 @@ def test_a_truncated_plate(name, shot, copied, refused):
 
 
 @pytest.mark.parametrize(
-    ("name", "option"),
-    [("plate", "--holdout"), ("matte", "--alpha"), ("matte", "--trimap")],
+    ("name", "option", "fault"),
+    [
+        (name, option, fault)
+        for name, option in (("plate", "--holdout"), ("matte", "--alpha"), ("matte", "--trimap"))
+        for fault in ("nowhere", "size", "gap", "text")
+        # Trimaps may be drawn for some of the frames only.
+        if (option, fault) != ("--trimap", "gap")
+    ],
 )
-@pytest.mark.parametrize("fault", ["nowhere", "size", "gap", "text"])
 def test_mattes_that_do_not_fit(name, option, fault, shot, copied, refused, tmp_path):
     mattes = tmp_path / "mattes"
     if fault != "nowhere":
@@ -239,6 +244,13 @@ def test_mattes_that_do_not_fit(name, option, fault, shot, copied, refused, tmp_
     assert {"nowhere": "mattes", "size": "20x10", "gap": "1003", "text": "m.1003.png"}[
         fault
     ] in said
+
+
+def test_trimaps_for_none_of_the_frames(shot, refused, tmp_path):
+    (tmp_path / "trimaps").mkdir()
+    write_png(tmp_path / "trimaps" / "t.0007.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    said = refused(shot.arguments("matte"), "--trimap", tmp_path / "trimaps")
+    assert "none of the frames" in said and "number the trimaps" in said
 
 
 def test_a_plane_mask_of_another_size(shot, refused, tmp_path):

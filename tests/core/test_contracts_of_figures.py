@@ -5,6 +5,7 @@ import pytest
 from hypothesis import strategies as st
 
 from shadowtool.core import holdout, matting, partial_coverage
+from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.robust_plates import hide, keyed
 from tests.core.contracts import (
@@ -40,17 +41,46 @@ def hidden(gray):
     return marked
 
 
+def before(lit, shadow):
+    lit, shadow = np.nan_to_num(lit), np.nan_to_num(np.minimum(lit, shadow))
+    noise = NoiseModel(np.full(3, 1e-4), np.full(3, 1e-6))
+    return Backdrop(lit, shadow, noise, np.zeros(lit.shape[:2], np.float32))
+
+
+def unknown(lit, shadow):
+    return np.asarray(np.isnan(lit).any(axis=-1))
+
+
+def is_figure(found, image):
+    shape = image.shape[:2]
+    return (
+        found.foreground.dtype == found.alpha.dtype == np.float32
+        and found.foreground.shape == image.shape
+        and found.alpha.shape == found.trimap.shape == shape
+        and np.isfinite(found.alpha).all()
+        and (found.alpha >= 0).all()
+        and (found.alpha <= 1).all()
+        and np.isfinite(found.foreground).all()
+        and (found.foreground >= 0).all()
+        and (found.foreground[found.alpha == 0] == 0).all()
+        and set(np.unique(found.trimap).tolist()) <= {0, 128, 255}
+    )
+
+
 CONTRACTS = {
     "pull_figure": Contract(
-        matting.pull_figure,
-        lambda h, w: st.tuples(picture(h, w), plane(h, w, UNIT), picture(h, w, TAME)),
-        lambda r, c, a, b: (
-            r.foreground.dtype == np.float32
-            and (r.foreground >= 0).all()
-            and (r.foreground[a == 0] == 0).all()
-            and (r.foreground[np.isnan(c)] == 0).all()
-            and np.isfinite(r.alpha).all()
+        lambda c, lit, shadow: matting.pull_figure(c, before(lit, shadow), unknown(lit, shadow)),
+        lambda h, w: st.tuples(picture(h, w), picture(h, w, TAME), picture(h, w, TAME)),
+        lambda r, c, lit, shadow: is_figure(r, c),
+    ),
+    "colour_figure": Contract(
+        lambda c, lit, shadow, a: matting.colour_figure(
+            c, before(lit, shadow), unknown(lit, shadow), a
         ),
+        lambda h, w: st.tuples(
+            picture(h, w), picture(h, w, TAME), picture(h, w, TAME), plane(h, w, UNIT)
+        ),
+        lambda r, c, lit, shadow, a: is_figure(r, c),
     ),
     "on_grid": Contract(
         lambda a: holdout.on_grid(a, 2),

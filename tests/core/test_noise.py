@@ -10,6 +10,7 @@ from shadowtool.core.noise import (
     sample_positions,
     thin,
 )
+from shadowtool.core.transfer import decode_srgb, encode_srgb
 
 SLOPE, FLOOR = 4.5e-5, 1e-6
 
@@ -50,6 +51,16 @@ def test_clean_or_single_frames_have_the_least_noise() -> None:
     still = take(1)
     for shots in (still, still * 5):
         assert model_of(shots).sigma(np.full(3, 0.5)) == pytest.approx([2e-4] * 3, rel=0.05)
+
+
+def test_eight_bits_are_not_taken_for_a_codec_that_freezes() -> None:
+    # Something moves through, which is what frames that are far apart would show.
+    shots = [
+        decode_srgb(np.round(encode_srgb(np.maximum(shot, 0)) * 255) / 255)
+        for shot in take(24, moving=True)
+    ]
+    true = np.sqrt(SLOPE * 0.18 + FLOOR)
+    assert model_of(shots).sigma(np.full(3, 0.18)) == pytest.approx([true] * 3, rel=0.25)
 
 
 def test_rounding_to_code_values_counts_as_noise() -> None:

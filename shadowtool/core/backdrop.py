@@ -1,0 +1,121 @@
+"""What a locked-off camera can see of the background: the line from S to L, and a little below S.
+
+β is carried on below 0: there the background is (1 + β)S, ground that a figure near to it takes
+some of the sky from, or whose S is only guessed.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.noise import NoiseModel
+
+Float32 = NDArray[np.float32]
+Places = tuple[slice, ...] | tuple[NDArray[np.intp], ...]
+
+# How much of S may be missing near to what stands on it.
+_DEEPEST = 0.5
+# How exact plates are, as a part of their value.
+_TOLERANCE = 0.01
+
+
+class Nearest(NamedTuple):
+    """The background that is likest to a pixel.
+
+    Attributes:
+        beta: (H, W) float32, from -0.5 to 1.
+        distance2: (H, W) float32 ≥ 0, squared distance from it in standard deviations.
+        from_lit2: (H, W) float32 ≥ 0, the same from L alone.
+    """
+
+    beta: Float32
+    distance2: Float32
+    from_lit2: Float32
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """The scene without the figure.
+
+    Attributes:
+        lit, shadow: (H, W, 3) float32, linear light, without NaN; or any pixels of it, (..., 3).
+        noise: the take's.
+        doubt: (H, W) float32, by how much S may be off besides, as a part of it.
+    """
+
+    lit: Float32
+    shadow: Float32
+    noise: NoiseModel
+    doubt: Float32
+
+    def at(self, places: Places) -> "Backdrop":
+        """Some of its pixels, by their rows and columns."""
+        return Backdrop(self.lit[places], self.shadow[places], self.noise, self.doubt[places])
+
+    def under(self, beta: Float32) -> Float32:
+        """What is seen under β, (..., 3); below 0 what is darker than S."""
+        lighter, deeper = np.maximum(beta, 0)[..., np.newaxis], np.minimum(beta, 0)[..., np.newaxis]
+        seen = lighter * self.lit + (1 + deeper - lighter) * self.shadow
+        return np.asarray(seen, np.float32)
+
+    def variance(self, image: Float32) -> Float32:
+        """Of what is seen of the background at these values, (..., 3): the noise's and the plates'
+        own."""
+        return self.noise_variance(image) + self.own_variance(image)
+
+    def noise_variance(self, image: Float32) -> Float32:
+        """Of the noise at these values, (..., 3)."""
+        slope, floor = self.noise.slope, self.noise.floor
+        return np.asarray(np.maximum(image, 0) * np.float32(slope) + np.float32(floor), np.float32)
+
+    def own_variance(self, image: Float32) -> Float32:
+        """Of the plates at these values, (..., 3)."""
+        value = np.maximum(image, 0)
+        doubtful = self.doubt[..., np.newaxis] * np.minimum(value, self.shadow)
+        return np.asarray((np.float32(_TOLERANCE) * value) ** 2 + doubtful**2, np.float32)
+
+    def from_lit2(self, image: Float32) -> Float32:
+        """Squared distance from L in standard deviations, (H, W)."""
+        total = np.zeros(image.shape[:2], np.float32)
+        for channel in range(3):
+            value = image[..., channel]
+            slope = np.float32(self.noise.slope[channel])
+            floor = np.float32(self.noise.floor[channel])
+            seen = np.maximum(value, 0)
+            variance = (slope + np.float32(_TOLERANCE**2) * seen) * seen + floor
+            total += (value - self.lit[..., channel]) ** 2 / variance
+        return total
+
+    def nearest(self, image: Float32) -> Nearest:
+        """The background that is likest to each pixel of a frame (H, W, 3)."""
+        shape = image.shape[:2]
+        square, from_lit2 = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        dots = np.zeros((2, *shape), np.float32)
+        lengths = np.full((2, *shape), 1e-9, np.float32)
+        variance = self.variance(image)
+        # By channel: sums over an axis of three are slow.
+        for channel in range(3):
+            weight = 1 / variance[..., channel]
+            shadow = self.shadow[..., channel]
+            above, span = image[..., channel] - shadow, self.lit[..., channel] - shadow
+            square += weight * above**2
+            from_lit2 += weight * (above - span) ** 2
+            for direction, dot, length in zip((span, shadow), dots, lengths, strict=True):
+                dot += weight * direction * above
+                length += weight * direction**2
+        between, below = (
+            np.clip(dot / length, low, high)
+            for dot, length, low, high in zip(dots, lengths, (0, -_DEEPEST), (1, 0), strict=True)
+        )
+        off_between, off_below = (
+            np.maximum(square - part * (2 * dot - part * length), 0)
+            for part, dot, length in zip((between, below), dots, lengths, strict=True)
+        )
+        deeper = off_below < off_between
+        return Nearest(
+            np.where(deeper, below, between),
+            np.where(deeper, off_below, off_between),
+            from_lit2,
+        )

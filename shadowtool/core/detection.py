@@ -1,0 +1,193 @@
+"""Finding the figure in a frame: where it shows what the background can't look like.
+
+Three kinds of evidence are weighed pixel by pixel, as logarithms of how much likelier a figure is
+than the background: distance from the background's line; distance from L itself, which matches in
+three channels where any shadow matches in two; and texture, which a shadow keeps and a figure
+hides. Evidence is then shared among neighbours of like colour.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.backdrop import Backdrop, Nearest
+from shadowtool.core.trimap import BACKGROUND, FIGURE
+
+Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+# What is still evidence for the background: half a squared distance from its line, and from L.
+# A figure's colours are spread over so many times more of what a pixel can be.
+_NEAR_LINE, _NEAR_LIT = 5.0, 9.0
+# No single pixel's colour says more than this, and no step between two.
+_MOST, _MOST_TEXTURE = 8.0, 6.0
+# A trimap from another frame is worth as much: it decides where colours don't.
+_HINT = 6.0
+# Logarithms are exact to the second, besides noise; steps that are off by more than the first count
+# less and less.
+_STEP, _LEAST_TEXTURE = 0.2, 0.03
+# Strength and range of the sharing, in 8-bit levels of this power of linear light: shade has as
+# many as light.
+_SHARING, _LIKE, _GUIDE_POWER = 20.0, 10.0, 0.3
+# A pixel at the figure's edge, or connected with it, that is so far off the line is not background.
+_OFF_LINE2 = 12.0
+# Of normal noise 9 pixels in 10 are within this distance of the line, in two dimensions.
+_NINE_TENTHS = 2.15
+_LARGEST_ERROR, _LEAST_SAMPLE = 3.0, 100
+# What is so many pixels from the figure has nothing of it; beside it begins sooner.
+_AWAY, _BESIDE = 5, 1
+# A figure is at least this part of the picture, a hole in it at least that; neither is but a few
+# pixels.
+_LEAST_FIGURE, _LEAST_HOLE, _FEW = 1 / 5000, 1 / 20000, 4
+
+
+class Found(NamedTuple):
+    """A figure in a frame.
+
+    Attributes:
+        mask: (H, W) bool, most of the pixel shows the figure; nothing thin.
+        maybe: (H, W) bool, mask and what hangs on it that is not background, strands above all.
+    """
+
+    mask: Bool
+    maybe: Bool
+
+
+def changed(image: Float32, backdrop: Backdrop) -> Bool:
+    """Where a frame is not plainly lit ground, (H, W)."""
+    # By itself the mean of nine squared distances is 3; noise alone does not get it to 9.
+    square = np.minimum(backdrop.from_lit2(image), np.float32(100))
+    return np.asarray(cv2.blur(square, (3, 3)) > 9)
+
+
+def find_figure(
+    image: Float32,
+    backdrop: Backdrop,
+    nearest: Nearest,
+    unknown: Bool,
+    hint: UInt8,
+    frame_size: int,
+) -> Found:
+    """The figure in a frame, or in a part of it.
+
+    Args:
+        image: (H, W, 3), linear light, without NaN.
+        nearest: `Backdrop.nearest` of it.
+        unknown: (H, W), nothing can be said of the pixel.
+        hint: (H, W) uint8, a trimap that may be a little off; 128 says nothing.
+        frame_size: how many pixels the whole frame has.
+    """
+    other = texture_evidence(image, backdrop)
+    other[unknown] = 0
+    other += np.float32(_HINT) * _leaning(hint)
+    guide = (np.clip(image, 0, 1) ** np.float32(_GUIDE_POWER) * 255).astype(np.uint8)
+
+    def mask_of(distance2: Float32) -> Bool:
+        evidence = np.minimum(distance2 / 2 - _NEAR_LINE, nearest.from_lit2 / 2 - _NEAR_LIT)
+        evidence = np.clip(evidence, -_MOST, _MOST)
+        evidence[unknown] = 0
+        evidence += other
+        shared = cv2.ximgproc.fastGlobalSmootherFilter(guide, evidence, _SHARING, _LIKE)
+        figure = (shared > 0).astype(np.uint8)
+        square = np.ones((3, 3), np.uint8)
+        edge = (cv2.dilate(figure, square) > 0) & (cv2.erode(figure, square) == 0)
+        figure[edge & (distance2 > _OFF_LINE2)] = 1
+        return _solid(figure, frame_size)
+
+    distance2 = nearest.distance2
+    mask = mask_of(distance2)
+    error = _background_error(nearest, mask)
+    if (error > 1).any():
+        distance2 = distance2 / error**2
+        mask = mask_of(distance2)
+    # What is thinner than three pixels is no limb.
+    limbs = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    strands = (distance2 > _OFF_LINE2) & (nearest.from_lit2 > _OFF_LINE2) & ~unknown
+    return Found(limbs, _connected(mask | strands, limbs))
+
+
+def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:
+    """How much better steps of log C from pixel to pixel are none than those of log L, (H, W).
+
+    Above 0 the ground's texture is hidden, below 0 it shows, 0 if it has none. Each pixel has half
+    of what the steps around it say.
+    """
+    value = np.maximum(_sum(image), np.float32(1e-3))
+    seen = np.log(value)
+    known = np.log(np.maximum(_sum(backdrop.lit), np.float32(1e-3)))
+    noise = backdrop.noise
+    slope, floor = np.float32(noise.slope.mean()), np.float32(noise.floor.sum())
+    variance = (slope * value + floor) / value**2 + np.float32(_LEAST_TEXTURE**2)
+    evidence = np.zeros_like(value)
+    for axis in (0, 1):
+        here = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
+        there = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
+        step = seen[there] - seen[here]
+        hidden, shown = step**2, (step - known[there] + known[here]) ** 2
+        # What neither explains is an edge, of a shadow or a figure.
+        weight = 1 / (1 + np.minimum(hidden, shown) / np.float32(_STEP**2))
+        said = weight * (shown - hidden) / (2 * (variance[here] + variance[there]))
+        said = np.clip(said, -_MOST_TEXTURE, _MOST_TEXTURE) / 2
+        evidence[here] += said
+        evidence[there] += said
+    return evidence
+
+
+def _leaning(hint: UInt8) -> Float32:
+    """1 in a trimap's figure, -1 in its background, and half as much at their borders, falling from
+    one to the other, (H, W): bands are drawn with the edge about in their middle."""
+    sure = np.where(hint == FIGURE, np.float32(1), -(hint == BACKGROUND).astype(np.float32))
+    if not ((hint == FIGURE).any() and (hint == BACKGROUND).any()):
+        return sure
+    figure, background = (
+        cv2.distanceTransform((hint != value).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+        for value in (FIGURE, BACKGROUND)
+    )
+    between = (background - figure) / (2 * (background + figure))
+    return np.asarray(np.where(sure == 0, between, sure), np.float32)
+
+
+def _sum(image: Float32) -> Float32:
+    """Of the channels."""
+    return np.asarray(image[..., 0] + image[..., 1] + image[..., 2], np.float32)
+
+
+def _background_error(nearest: Nearest, mask: Bool) -> Float32:
+    """By how much more than noise the background is off its line, (H, W) ≥ 1: compression and
+    coarse chroma, which do most harm around what moves, in shade and at its edge."""
+    figure = mask.astype(np.uint8)
+    away, beside = (
+        cv2.dilate(figure, np.ones((2 * radius + 1,) * 2, np.uint8)) == 0
+        for radius in (_AWAY, _BESIDE)
+    )
+    error = np.ones(mask.shape, np.float32)
+    full, part = nearest.beta < 0.03, (nearest.beta >= 0.03) & (nearest.beta < 0.95)
+    for shade, sample in ((full, away), (part, away), (~full & ~part, beside & ~away)):
+        distance2 = nearest.distance2[shade & sample]
+        if distance2.size >= _LEAST_SAMPLE:
+            typical = np.sqrt(np.quantile(distance2, 0.9)) / _NINE_TENTHS
+            error[shade] = np.clip(typical, 1, _LARGEST_ERROR)
+    return error
+
+
+def _solid(figure: UInt8, frame_size: int) -> Bool:
+    """Without specks, its small holes closed."""
+    for value, least, connectivity in ((1, _LEAST_FIGURE, 8), (0, _LEAST_HOLE, 4)):
+        part = (figure == value).astype(np.uint8)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=connectivity)
+        small = stats[:, cv2.CC_STAT_AREA] < max(least * frame_size, _FEW)
+        small[0] = False
+        figure = np.where(small[labels], np.uint8(1 - value), figure)
+    return np.asarray(figure > 0)
+
+
+def _connected(mask: Bool, seeds: Bool) -> Bool:
+    """The connected parts of a mask that hold a seed."""
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    kept = np.zeros(int(labels.max()) + 1, bool)
+    kept[labels[seeds]] = True
+    kept[0] = False
+    return np.asarray(kept[labels])

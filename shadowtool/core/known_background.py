@@ -1,0 +1,282 @@
+"""Alpha and colour of a figure before a background that is known but for its shadow.
+
+C = αF + (1 - α)B(β). F is that of a near part of the figure, give or take; β is that of the ground
+around, give or take. For each of several near parts the most probable α and β follow in closed form
+(after Bayesian matting, Chuang et al. 2001, whose background is here a line), and what they give is
+averaged by how well each explains the pixel.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.filling import fill_membrane
+from shadowtool.core.trimap import FIGURE, UNKNOWN, Prior
+
+Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
+Index = NDArray[np.intp]
+Places = tuple[Index, ...]
+Bool = NDArray[np.bool_]
+
+# How far the figure's colour is from that of its near part, as a part of it, and at least.
+_COLOUR, _LEAST_COLOUR = 0.08, 0.002
+# Once alpha is known, how far the pixel's own may be.
+_OWN_COLOUR = 0.6
+# How far β is from that of the ground around where that is even.
+_BETA = 0.02
+# Under a foot there may be shadow that is only seen so far away, rarely: exp(-the second).
+_DARKEST_RADIUS, _UNSEEN = 6, 2.0
+# Within so many pixels β is looked at for evenness.
+_EVEN_RADIUS = 4
+# What near parts of the figure are tried: the nearest, and those nearest to places this far off;
+# one at this distance counts less by exp(-1/2).
+_AROUND, _FAR = 3.0, 6.0
+_ROUNDS = 2
+_BLOCK = 1 << 16
+
+
+class Solved(NamedTuple):
+    """A figure's matte and colour.
+
+    Attributes:
+        alpha: (H, W) float32 in [0, 1].
+        foreground: (H, W, 3) float32 ≥ 0, F where alpha is above 0, not premultiplied.
+        error: (H, W) float32, standard deviation of alpha where the trimap is unknown, else 0.
+        misfit: (H, W) float32, squared distance of C from its explanation in standard deviations,
+            where the trimap is unknown, else 0.
+    """
+
+    alpha: Float32
+    foreground: Float32
+    error: Float32
+    misfit: Float32
+
+
+def ground_beta(beta: Float32, ground: Bool) -> Float32:
+    """β of the ground that is seen, carried on behind what hides it.
+
+    Args:
+        beta: (H, W), may be below 0.
+        ground: (H, W), where it is that of the ground.
+
+    Returns:
+        (H, W) float32; 1 if no ground is seen.
+    """
+    if not ground.any():
+        return np.ones_like(beta)
+    known = np.where(ground, beta, np.float32(0))[..., np.newaxis]
+    return fill_membrane(known, ground.astype(np.float32))[..., 0]
+
+
+def solve(
+    image: Float32, trimap: UInt8, behind: Float32, backdrop: Backdrop, prior: Prior | None = None
+) -> Solved:
+    """Alpha and F where a trimap is unknown.
+
+    Args:
+        image: (H, W, 3) float32, linear light, without NaN.
+        trimap: (H, W) uint8; 0 and 255 are kept as they are. Without any 255 all is background:
+            there is no figure to mix with.
+        behind: (H, W), β from `ground_beta`.
+        prior: of alpha; None if all of [0, 1] is as likely.
+    """
+    alpha = np.where(trimap == FIGURE, np.float32(1), np.float32(0))
+    foreground = image * alpha[..., np.newaxis]
+    error, misfit = np.zeros_like(alpha), np.zeros_like(alpha)
+    solid = trimap == FIGURE
+    if not solid.any():
+        return Solved(alpha, foreground, error, misfit)
+    for part in _blocks(trimap == UNKNOWN):
+        mean = np.full(part[0].shape, 0.5, np.float32)
+        deviation = np.full(part[0].shape, 3, np.float32)
+        if prior is not None:
+            mean, deviation = prior.mean[part], prior.deviation[part]
+        pixels = _gather(image, solid, part, behind, backdrop, darkest=prior is not None)
+        alpha[part], error[part], misfit[part], share = _most_probable(pixels, mean, deviation)
+        foreground[part] = _colour(pixels, alpha[part], error[part], share).T
+    return Solved(alpha, np.maximum(foreground, 0), error, misfit)
+
+
+def colours(image: Float32, alpha: Float32, behind: Float32, backdrop: Backdrop) -> Float32:
+    """F for an alpha that is given; arguments as for `solve`.
+
+    Where nothing is quite opaque, what is most so stands for the figure's colour.
+
+    Returns:
+        (H, W, 3) float32 ≥ 0, not premultiplied; 0 where alpha is 0.
+    """
+    solid = alpha >= min(0.99, float(alpha.max()))
+    foreground = np.where((solid & (alpha > 0))[..., np.newaxis], image, np.float32(0))
+    for part in _blocks((alpha > 0) & ~solid):
+        pixels = _gather(image, solid, part, behind, backdrop, darkest=True)
+        given = alpha[part]
+        *_, share = _most_probable(pixels, given, np.full(given.shape, 1e-3, np.float32))
+        foreground[part] = _colour(pixels, given, np.zeros_like(given), share).T
+    return np.maximum(foreground, 0)
+
+
+def _blocks(mask: Bool) -> Iterator[Places]:
+    """The mask's pixels, so many at a time that memory stays bounded."""
+    rows, columns = np.nonzero(mask)
+    for start in range(0, rows.size, _BLOCK):
+        yield rows[start : start + _BLOCK], columns[start : start + _BLOCK]
+
+
+class _Pixels(NamedTuple):
+    """N pixels that are mixed, and K near parts of the figure for each; colours by channel.
+
+    Attributes:
+        seen, noise: (3, N, 1), C and the variance of its noise.
+        behind, shift, error: (3, N, K), B, by how much it changes with β, and the variance of its
+            own error.
+        even: (N, 1), standard deviation of β.
+        figure: (3, N, K), F of the near parts.
+        far: (N, K), how much the likelihood's logarithm falls with their distance.
+    """
+
+    seen: Float32
+    noise: Float32
+    behind: Float32
+    shift: Float32
+    error: Float32
+    even: Float32
+    figure: Float32
+    far: Float32
+
+
+def _gather(
+    image: Float32,
+    solid: Bool,
+    unknown: Places,
+    behind: Float32,
+    backdrop: Backdrop,
+    darkest: bool,
+) -> _Pixels:
+    """With ``darkest`` the last near part is the nearest once more, before the darkest ground
+    around."""
+    rows, columns = unknown
+    height, width = solid.shape
+    steps = [(0, 0)]
+    for turn in range(8):
+        angle = turn * np.pi / 4
+        steps.append((round(_AROUND * np.sin(angle)), round(_AROUND * np.cos(angle))))
+    betas, which = [behind[unknown]], [0] * len(steps)
+    if darkest:
+        window = np.ones((2 * _DARKEST_RADIUS + 1,) * 2, np.uint8)
+        betas.append(np.asarray(cv2.erode(behind, window)[unknown], np.float32))
+        which.append(1)
+        steps.append(steps[0])
+    near = _nearest(solid)
+    chosen = np.stack(
+        [
+            near[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]
+            for down, right in steps
+        ],
+        axis=1,
+    )
+    away = (chosen // width - rows[:, np.newaxis]) ** 2
+    away = away + (chosen % width - columns[:, np.newaxis]) ** 2
+    far = (away / (2 * _FAR**2)).astype(np.float32)
+    if darkest:
+        far[:, -1] += np.float32(_UNSEEN)
+    sample, plates = image[unknown], backdrop.at(unknown)
+    span = plates.lit - plates.shadow
+    shifts = [np.where(beta[:, np.newaxis] >= 0, span, plates.shadow) for beta in betas]
+    grounds = [plates.under(beta) for beta in betas]
+    return _Pixels(
+        seen=_by_channel(sample),
+        noise=_by_channel(plates.noise_variance(sample)),
+        behind=_by_channel(*grounds)[..., which],
+        shift=_by_channel(*shifts)[..., which],
+        error=_by_channel(*(plates.own_variance(ground) for ground in grounds))[..., which],
+        even=_unevenness(behind)[unknown][:, np.newaxis],
+        figure=np.ascontiguousarray(np.moveaxis(image.reshape(-1, 3)[chosen], -1, 0)),
+        far=far,
+    )
+
+
+def _by_channel(*values: Float32) -> Float32:
+    """K times (N, 3) as (3, N, K)."""
+    return np.stack([value.T for value in values], axis=-1)
+
+
+def _nearest(solid: Bool) -> Index:
+    """For each pixel the place of the mask's nearest, counted row by row."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~solid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    places = np.zeros(int(labels.max()) + 1, np.intp)
+    places[labels[solid]] = np.flatnonzero(solid)
+    return np.asarray(places[labels], np.intp)
+
+
+def _unevenness(behind: Float32) -> Float32:
+    """The standard deviation to expect of β behind the figure, (H, W)."""
+    size = 2 * _EVEN_RADIUS + 1
+    mean = cv2.blur(behind, (size, size))
+    scatter = cv2.blur(behind**2, (size, size)) - mean**2
+    return np.asarray(np.float32(_BETA) + np.sqrt(np.maximum(scatter, 0)), np.float32)
+
+
+def _most_probable(
+    pixels: _Pixels, mean: Float32, deviation: Float32
+) -> tuple[Float32, Float32, Float32, Float32]:
+    """Alpha, its standard deviation and the least misfit (N), and how much each near part explains
+    (N, K).
+
+    With the variance of C fixed the posterior of alpha and of how far (1 - α)β is from what is
+    expected is normal; the variance, which depends on alpha, follows in a second round.
+    """
+    mean = mean[:, np.newaxis]
+    trust = 1 / deviation[:, np.newaxis] ** 2
+    contrast, above = pixels.figure - pixels.behind, pixels.seen - pixels.behind
+    colour = _colour_variance(pixels.figure)
+    alpha = np.broadcast_to(mean, contrast.shape[1:])
+    for _ in range(_ROUNDS):
+        variance = pixels.noise + alpha**2 * colour + (1 - alpha) ** 2 * pixels.error
+        weight = 1 / variance
+        even = 1 / (pixels.even * np.maximum(1 - alpha, np.float32(0.05))) ** 2
+        weighted = weight * contrast
+        alpha_alpha = (weighted * contrast).sum(axis=0) + trust
+        alpha_beta = (weighted * pixels.shift).sum(axis=0)
+        beta_beta = (weight * pixels.shift**2).sum(axis=0) + even
+        alpha_side = (weighted * above).sum(axis=0) + trust * mean
+        beta_side = (weight * pixels.shift * above).sum(axis=0)
+        determinant = alpha_alpha * beta_beta - alpha_beta**2
+        alpha = (alpha_side * beta_beta - beta_side * alpha_beta) / determinant
+        alpha = np.clip(alpha, 0, 1)
+        beta = (beta_side - alpha_beta * alpha) / beta_beta
+    rest = above - alpha * contrast - beta * pixels.shift
+    misfit = (weight * rest**2).sum(axis=0) + even * beta**2
+    likelihood = misfit + np.log(variance).sum(axis=0) + trust * (alpha - mean) ** 2
+    likelihood = -(likelihood + np.log(determinant / (even * trust))) / 2 - pixels.far
+    share = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
+    share /= share.sum(axis=1, keepdims=True)
+    average = (share * alpha).sum(axis=1)
+    spread = (share * (alpha**2 + beta_beta / determinant)).sum(axis=1) - average**2
+    return average, np.sqrt(np.maximum(spread, 0)), misfit.min(axis=1), share
+
+
+def _colour_variance(figure: Float32) -> Float32:
+    return np.asarray((np.float32(_COLOUR) * figure + np.float32(_LEAST_COLOUR)) ** 2, np.float32)
+
+
+def _colour(pixels: _Pixels, alpha: Float32, uncertain: Float32, share: Float32) -> Float32:
+    """F (3, N) for an alpha that is known but for its standard deviation: between that of the near
+    parts and what C tells of it."""
+    expected = (share * pixels.figure).sum(axis=-1)
+    prior = (np.float32(_OWN_COLOUR) * expected + np.float32(_LEAST_COLOUR)) ** 2
+    behind, error = ((share * values).sum(axis=-1) for values in (pixels.behind, pixels.error))
+    rest = pixels.seen[..., 0] - alpha * expected - (1 - alpha) * behind
+    variance = alpha**2 * prior + pixels.noise[..., 0] + (1 - alpha) ** 2 * error
+    variance = variance + (uncertain * (expected - behind)) ** 2
+    # What β may be off by errs in all channels together: rank one more in the covariance.
+    off = (1 - alpha) * (share * pixels.even * pixels.shift).sum(axis=-1)
+    together = (off * rest / variance).sum(axis=0) / (1 + (off**2 / variance).sum(axis=0))
+    rest = rest - together * off
+    return np.asarray(expected + alpha * prior * rest / variance, np.float32)

@@ -1,0 +1,113 @@
+"""Trimaps drawn for some frames of a take, and what becomes of them in the others."""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shadowtool.choices import Missing
+from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
+from shadowtool.core.trimap_flow import Carried, Link, carry, flow_picture, links, merge
+from shadowtool.errors import DamagedFileError, InputError
+from shadowtool.io.image import read_image
+from shadowtool.io.sequence import Frame, Sequence
+from shadowtool.steps.footage import Footage, require_frames
+
+UInt8 = NDArray[np.uint8]
+
+# From further away nothing comes through, and no more links are kept for the next frames.
+_FURTHEST = 24
+
+
+@dataclass(frozen=True)
+class Keyframes:
+    """The trimaps that were drawn.
+
+    Attributes:
+        drawn: their files.
+        footage: the take.
+        missing: whether frames on the way that can't be read are passed over.
+        links: between two frames, there and back.
+    """
+
+    drawn: Sequence
+    footage: Footage
+    missing: Missing
+    links: Callable[[Frame, Frame], tuple[Link, Link]]
+
+    @classmethod
+    def of(cls, drawn: Sequence, footage: Footage, missing: Missing) -> "Keyframes":
+        """Raises InputError if they don't fit the take."""
+        frames = [frame for frame in drawn.files if frame in footage.sequence.files]
+        if not frames:
+            raise InputError(
+                f"{drawn.pattern}: has none of the frames of {footage.sequence.pattern};"
+                " number the trimaps as the frames are"
+            )
+        require_frames(drawn, frames, footage.header, footage.sequence.pattern, missing)
+
+        def between(here: Frame, there: Frame) -> tuple[Link, Link]:
+            return links(*(flow_picture(footage.read(frame)) for frame in (here, there)))
+
+        return cls(drawn, footage, missing, lru_cache(_FURTHEST)(between))
+
+    def sources(self, frame: Frame) -> list[Path]:
+        """What a frame's trimap is made of."""
+        files = [self.drawn.path(key) for key in self._keys(frame)]
+        for key in self._keys(frame):
+            files += [self.footage.sequence.path(step) for step in self._way(frame, key)[1:]]
+        return files
+
+    def trimap(self, frame: Frame) -> UInt8:
+        """A frame's trimap, (H, W) uint8: as drawn, or carried from the keyframes beside it; all
+        unknown if they are too far away."""
+        sides = [self._carried(frame, key) for key in self._keys(frame)]
+        if not sides:
+            width, height = self.footage.header.size
+            return np.full((height, width), UNKNOWN, np.uint8)
+        return merge(sides)
+
+    def _keys(self, frame: Frame) -> list[Frame]:
+        """The keyframe itself, or those before and after that are near enough."""
+        keys = sorted(key for key in self.drawn.files if key in self.footage.sequence.files)
+        before = keys[: bisect_right(keys, frame)][-1:]
+        after = keys[bisect_left(keys, frame) :][:1]
+        keys = before if before == after else before + after
+        return [key for key in keys if len(self._way(frame, key)) <= _FURTHEST + 1]
+
+    def _way(self, frame: Frame, key: Frame) -> list[Frame]:
+        """The take's frames from one to a keyframe, both included."""
+        low, high = min(frame, key), max(frame, key)
+        way = [step for step in self.footage.sequence.frames if low <= step <= high]
+        return way if frame <= key else way[::-1]
+
+    def _carried(self, frame: Frame, key: Frame) -> Carried:
+        way = [step for step in self._way(frame, key) if self._can_be_read(step)]
+        return carry(trimap_of(self.drawn.path(key)), [self._link(*pair) for pair in pairwise(way)])
+
+    def _can_be_read(self, frame: Frame) -> bool:
+        if self.missing == "error":
+            return True
+        try:
+            self.footage.read(frame)
+        except DamagedFileError:
+            return False
+        return True
+
+    def _link(self, here: Frame, there: Frame) -> Link:
+        there_and_back = self.links(min(here, there), max(here, there))
+        return there_and_back[0] if here < there else there_and_back[1]
+
+
+def trimap_of(path: Path) -> UInt8:
+    """A trimap from a file, (H, W) uint8: what is nearly black or white, and the rest unknown."""
+    plane = np.nan_to_num(read_image(path).plane("Y", "G"))
+    trimap = np.full(plane.shape, UNKNOWN, np.uint8)
+    trimap[plane < 0.25] = BACKGROUND
+    trimap[plane > 0.75] = FIGURE
+    return trimap

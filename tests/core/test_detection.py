@@ -1,0 +1,116 @@
+import cv2
+import numpy as np
+import pytest
+
+from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.detection import Found, changed, find_figure, texture_evidence
+from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
+from tests.figures import BACKDROP, DARK, KNOWN, SCENE, disk, shot, strand
+
+NOTHING = np.full(KNOWN.shape, UNKNOWN, np.uint8)
+
+
+def found_in(image: np.ndarray, backdrop: Backdrop = BACKDROP, hint: np.ndarray = NOTHING) -> Found:
+    return find_figure(image, backdrop, backdrop.nearest(image), KNOWN, hint, KNOWN.size)
+
+
+@pytest.mark.parametrize("soft", [1, 6, 40])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_shadow_is_no_figure(soft: float, seed: int) -> None:
+    image = SCENE.noisy(SCENE.image(SCENE.disk(80, 50, radius=25, soft=soft)), seed)
+    assert not found_in(image).maybe.any()
+
+
+@pytest.mark.parametrize("deeper", [0.6, 0.8])
+def test_ground_that_loses_some_of_the_sky_is_no_figure(deeper: float) -> None:
+    beta = SCENE.disk(80, 50, radius=25, soft=6)
+    image = SCENE.image(beta)
+    image[40:60, 70:90] *= np.float32(deeper)
+    assert not found_in(SCENE.noisy(image, 2)).mask.any()
+
+
+@pytest.mark.parametrize("lit", [True, False])
+def test_a_figure_is_found_to_the_pixel_in_light_and_in_shadow(lit: bool) -> None:
+    alpha = disk(70, 50, 20)
+    beta = None if lit else SCENE.disk(70, 50, radius=40, soft=6)
+    mask = found_in(shot(alpha, beta).image).mask
+    assert mask[alpha == 1].all()
+    assert not mask[alpha == 0].any()
+
+
+def test_dark_clothes_in_shadow_are_told_from_it_by_the_texture_that_they_hide() -> None:
+    alpha = disk(70, 50, 20)
+    mask = found_in(shot(alpha, SCENE.disk(70, 50, radius=40, soft=6), DARK).image).mask
+    assert mask[alpha == 1].mean() > 0.99
+    assert not mask[disk(70, 50, 22) == 0].any()
+
+
+def test_a_hair_hangs_on_the_head() -> None:
+    head = disk(60, 60, 16)
+    hair = strand((60, 60), (110, 20), 0.8)
+    found = found_in(shot(np.maximum(head, hair)).image)
+    middle = (hair >= 0.5) & (disk(60, 60, 20) == 0)
+    assert found.maybe[middle].mean() > 0.95
+
+
+def test_specks_are_no_figure_and_a_pinhole_is_none_in_it() -> None:
+    alpha = disk(70, 50, 20)
+    alpha[10, 10], alpha[50, 70] = 1, 0
+    mask = found_in(shot(alpha).image).mask
+    assert not mask[10, 10]
+    assert mask[50, 70]
+
+
+def test_pixels_of_which_nothing_is_known_follow_their_neighbours() -> None:
+    alpha = disk(70, 50, 20)
+    unknown = np.zeros_like(KNOWN)
+    unknown[48:52, 68:72] = unknown[10:14, 10:14] = True
+    image = shot(alpha).image
+    image[unknown] = 0
+    mask = find_figure(image, BACKDROP, BACKDROP.nearest(image), unknown, NOTHING, KNOWN.size).mask
+    assert mask[48:52, 68:72].all() and not mask[10:14, 10:14].any()
+
+
+def test_a_hint_decides_where_the_frame_says_nothing_and_nowhere_else() -> None:
+    even = np.full_like(SCENE.lit, 0.5)
+    backdrop = Backdrop(even, even / 4, BACKDROP.noise, BACKDROP.doubt)
+    figure, hole = disk(60, 50, 20) > 0, disk(60, 50, 8) > 0
+    image = np.where(figure[..., None] & ~hole[..., None], np.float32([0.1, 0.2, 0.6]), even)
+    hint = np.where(figure, FIGURE, BACKGROUND)
+    assert found_in(image, backdrop, hint).mask[hole].mean() < 0.1
+    dark = np.where(hole[..., None], np.float32(0.2), image)
+    assert found_in(dark, backdrop, hint).mask[hole].all()
+    assert not found_in(even, backdrop, hint).mask.any()
+
+
+def around(evidence: np.ndarray) -> np.ndarray:
+    return cv2.blur(evidence, (9, 9))
+
+
+def test_texture_shows_through_any_shadow_and_not_through_a_figure() -> None:
+    shadow = SCENE.image(SCENE.disk(80, 50, 30, soft=20))
+    showing = texture_evidence(SCENE.noisy(shadow, 1), BACKDROP)
+    assert (around(showing) < 0).mean() > 0.98
+    covered = texture_evidence(shot(np.ones(KNOWN.shape)).image, BACKDROP)
+    assert (around(covered) > 0).mean() > 0.98
+
+
+def test_the_edges_of_a_shadow_say_nothing_of_texture() -> None:
+    sharp = SCENE.disk(80, 50, 30, soft=1)
+    edge = (sharp > 0.02) & (sharp < 0.98)
+    evidence = texture_evidence(SCENE.image(sharp), BACKDROP)
+    assert np.abs(evidence[edge]).mean() < np.abs(evidence[~edge]).mean()
+    assert (around(evidence) < 0).mean() > 0.98
+
+
+def test_ground_without_texture_says_nothing() -> None:
+    even = np.full_like(SCENE.lit, 0.5)
+    evidence = texture_evidence(even, Backdrop(even, even / 4, BACKDROP.noise, BACKDROP.doubt))
+    assert evidence == pytest.approx(0, abs=1e-4)
+
+
+def test_lit_ground_has_not_changed_and_a_shadow_has() -> None:
+    beta = SCENE.disk(80, 50, radius=20)
+    change = changed(SCENE.noisy(SCENE.image(beta), 5), BACKDROP)
+    assert change[beta < 0.5].all()
+    assert not change[SCENE.disk(80, 50, radius=27) == 1].any()

@@ -80,7 +80,11 @@ def fit_shadow_lines(
     Raises:
         NoLinesError: fewer than two frames have a usable line.
     """
-    groups = zero_crossings(time, plane, frames)
+    return fit_lines(zero_crossings(time, plane, frames), frames)
+
+
+def fit_lines(groups: dict[int, Float64], frames: Float64) -> ShadowLines:
+    """`fit_shadow_lines` to points that `zero_crossings` found."""
     fitted = {i: _fit(points) for i, points in groups.items() if len(points) >= _LEAST_POINTS}
     fits = {i: line for i, line in fitted.items() if line is not None}
     if len(fits) < 2:
@@ -170,7 +174,7 @@ class Bend(NamedTuple):
 
 
 def line_bend(
-    time: NDArray[np.float32], plane: NDArray[np.bool_], frames: Float64, lines: ShadowLines
+    groups: dict[int, Float64], frames: Float64, lines: ShadowLines, size: tuple[int, int]
 ) -> Bend:
     """Whether the lines' residuals bend systematically.
 
@@ -179,17 +183,16 @@ def line_bend(
     that no straight line takes up is left in the residuals, and it has the same k in all lines.
 
     Args:
-        time, plane, frames: as for `fit_shadow_lines`.
+        groups, frames: as for `fit_lines`.
         lines: what that made of them.
+        size: of the picture, (W, H).
     """
-    height, width = time.shape
+    width, height = size
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    some = np.searchsorted(frames, lines.frame)[:: max(1, len(lines) // _BENT_LINES)]
-    groups = zero_crossings(time, plane, frames[some])
-    at = {float(frame): i for i, frame in enumerate(lines.frame)}
+    indices = np.searchsorted(frames, lines.frame)
     found, weights = [], []
-    for index, points in groups.items():
-        line = at[float(frames[some[index]])]
+    for line in range(0, len(lines), max(1, len(lines) // _BENT_LINES)):
+        points = groups.get(int(indices[line]), np.zeros((0, 2)))
         normal, offset = lines.normal[line], lines.offset[line]
         residual = points @ normal + offset
         near = np.abs(residual) < _NEAR

@@ -150,6 +150,8 @@ class CrossingFinder:
             self._after = self._low.copy()
             self._before, self._earlier, self._next = (self._lower.copy() for _ in range(3))
             self._moved = np.arange(gray.size)
+            self._darker = np.arange(gray.size)
+            self._unseen = bool(np.isnan(self._low).any())
             self._at = np.zeros(gray.size, np.int32)
             self._lost = np.zeros(gray.size, bool)
         self._recent.append(gray)
@@ -182,26 +184,33 @@ class CrossingFinder:
     def _look(self, gray: Float32) -> None:
         """Only where a frame is the darkest so far can the crossing move."""
         now = gray.ravel()
-        low, high = self._low, self._high
+        low, high, after = self._low, self._high, self._after
         self._next[self._moved] = now[self._moved]
         np.fmax(high, now, out=high)
         darker = np.flatnonzero(now < low)
-        # What is nearly as bright as it ever was crosses no threshold that matters in the end.
-        darker = darker[now[darker] < _NEARLY_LIT * high[darker]]
-        threshold = (high[darker] + now[darker]) / np.float32(2)
-        fresh = low[darker] >= np.minimum(threshold, _NEARLY_LIT * high[darker])
-        stale = ~fresh & ~(self._after[darker] < threshold)
-        moved = [darker[fresh]]
-        self._take(moved[0], 0, now)
-        self._lost[moved[0]] = False
-        self._floor[moved[0]] = self._lower[moved[0]]
-        np.fmin(low, now, out=self._lower)
-        self._lower, self._low = low, self._lower
-        old, threshold = darker[stale], threshold[stale]
+        values, lit = now[darker], high[darker]
+        # What is nearly as bright as it ever was crosses no threshold that matters in the end; and
+        # the crossing found last stands as long as the threshold is above it.
+        threshold = (lit + values) / np.float32(2)
+        crossed = (values < _NEARLY_LIT * lit) & ~(after[darker] < threshold)
+        some, threshold = darker[crossed], threshold[crossed]
+        fresh = low[some] >= np.minimum(threshold, _NEARLY_LIT * lit[crossed])
+        begun = some[fresh]
+        self._take(begun, 0, now)
+        self._lost[begun] = False
+        self._floor[begun] = self._lower[begun]
+        self._lower[self._darker] = low[self._darker]
+        low[darker] = values
+        self._darker = darker
+        if self._unseen:
+            first = np.flatnonzero(np.isnan(low) & ~np.isnan(now))
+            low[first] = now[first]
+            self._unseen = bool(np.isnan(low).any())
+            self._darker = np.concatenate([darker, first])
+        old, threshold = some[~fresh], threshold[~fresh]
         onward = self._next[old] < threshold
         self._shift(old[onward])
-        moved.append(self._search(old[~onward], threshold[~onward], now))
-        self._moved = np.concatenate(moved)
+        self._moved = np.concatenate([begun, self._search(old[~onward], threshold[~onward], now)])
 
     def _take(self, pixels: NDArray[np.intp], ago: int, now: Float32) -> None:
         """Put the crossing of these pixels into the frame so many ago."""

@@ -14,9 +14,10 @@ from shadowtool.core.shadow_lines import (
     Bend,
     NoLinesError,
     ShadowLines,
-    fit_shadow_lines,
+    fit_lines,
     line_bend,
     line_speed,
+    zero_crossings,
 )
 from shadowtool.core.shadow_time import (
     CrossingFinder,
@@ -105,14 +106,15 @@ def scan(
             footage.sequence.pattern,
         )
     times = _times(crossings, noise, region, numbers, run.jobs)
+    points = zero_crossings(times.time, region, numbers)
     try:
-        lines = fit_shadow_lines(times.time, region, numbers)
+        lines = fit_lines(points, numbers)
     except NoLinesError as error:
         raise ReshootError(
             f"{footage.sequence.pattern}: reshoot: {error}; sweep the shadow across the plane,"
             " or mark a larger plane"
         ) from None
-    bend = line_bend(times.time, region, numbers, lines)
+    bend = line_bend(points, numbers, lines, footage.header.size)
     figures = _figures(times, lines, used, bend)
     _advise(figures, footage.sequence.pattern)
     mark = recipe.fingerprint([plane_mark, *marks])

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 
 from shadowtool.core.shadow_lines import (
+    Bend,
     NoLinesError,
     ShadowLines,
+    fit_lines,
     fit_shadow_lines,
     interpolate_lines,
     line_bend,
@@ -165,6 +167,11 @@ def bowed(sweep: Sweep, strength: float) -> np.ndarray:
     return ((place @ normal + offset) / sweep.speed).astype(np.float32)
 
 
+def bend_of(time: np.ndarray, plane: np.ndarray, frames: np.ndarray) -> Bend:
+    points = zero_crossings(time, plane, frames)
+    return line_bend(points, frames, fit_lines(points, frames), (SCENE.width, SCENE.height))
+
+
 @pytest.mark.parametrize("angle", [0.2, 1.4, 2.6])
 @pytest.mark.parametrize("strength", [-0.03, 0.02])
 def test_a_lens_that_bows_lines_is_found(angle: float, strength: float) -> None:
@@ -172,8 +179,7 @@ def test_a_lens_that_bows_lines_is_found(angle: float, strength: float) -> None:
     frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
     everywhere = np.ones_like(SCENE.plane)
     time = bowed(sweep, strength)
-    lines = fit_shadow_lines(time, everywhere, frames)
-    bend = line_bend(time, everywhere, frames, lines)
+    bend = bend_of(time, everywhere, frames)
     # At half the height from the middle and half the width along: strength · ρ · u².
     assert bend.pixels == pytest.approx(-strength * SCENE.height / 2, rel=0.25)
     assert bend.certainty > 10
@@ -185,8 +191,7 @@ def test_straight_lines_do_not_bend() -> None:
         frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
         rng = np.random.default_rng(0)
         time = edge_times(sweep) + rng.normal(scale=0.05, size=SCENE.plane.shape)
-        lines = fit_shadow_lines(time.astype(np.float32), SCENE.plane, frames)
-        bend = line_bend(time.astype(np.float32), SCENE.plane, frames, lines)
+        bend = bend_of(time.astype(np.float32), SCENE.plane, frames)
         assert abs(bend.pixels) < 0.1
 
 

@@ -90,9 +90,11 @@ def warp_picture(image: NDArray[np.floating], warp_map: WarpMap, step: int = 16)
 
 
 def _write(canvas: UInt8, text: str) -> None:
-    place, font = (8, canvas.shape[0] - 10), cv2.FONT_HERSHEY_SIMPLEX
-    for colour, width in (((0, 0, 0), 3), ((235, 235, 235), 1)):
-        cv2.putText(canvas, text, place, font, 0.4, colour, width, cv2.LINE_AA)
+    font, x, y = cv2.FONT_HERSHEY_SIMPLEX, 8, canvas.shape[0] - 10
+    # A wider stroke would also set the letters further apart: the outline is the text, moved.
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        cv2.putText(canvas, text, (x + dx, y + dy), font, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.putText(canvas, text, (x, y), font, 0.4, (235, 235, 235), 1, cv2.LINE_AA)
 
 
 def _dimmed(image: NDArray[np.floating]) -> UInt8:

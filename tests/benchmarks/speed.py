@@ -10,6 +10,7 @@ what the command reads, and decoding it and encoding what the command writes.
 import argparse
 import importlib.util
 import json
+import multiprocessing
 import os
 import shutil
 import statistics
@@ -18,6 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -475,8 +477,11 @@ def main() -> None:
             folder = (options.footage or work) / f"{size[0]}x{size[1]}-{frames}"
             footage = Footage(folder, size, frames)
             if not (folder / "length.exr").exists():
-                make_footage(folder, size, frames)
-                prepare_for_oiiotool(footage)
+                # In a process of its own: what this one has held counts as held by its children.
+                apart = multiprocessing.get_context("spawn")
+                with ProcessPoolExecutor(1, apart) as pool:
+                    pool.submit(make_footage, folder, size, frames).result()
+                    pool.submit(prepare_for_oiiotool, footage).result()
             own = work / f"work-{size[0]}-{frames}"
             own.mkdir(exist_ok=True)
             return Stage(footage, own, options.jobs)

@@ -186,7 +186,7 @@ def _window_sum(image: Float32) -> Float32:
     return np.asarray(total, np.float32)
 
 
-def fill_beta(beta: Float32, never_shaded: Bool, hidden: Bool, fill: Fill) -> Float32:
+def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> Float32:
     """Give unknown pixels a value.
 
     With ``lit`` they become 1. With ``inpaint`` small unknown patches and what the figure hides
@@ -196,7 +196,7 @@ def fill_beta(beta: Float32, never_shaded: Bool, hidden: Bool, fill: Fill) -> Fl
 
     Args:
         beta: (H, W) float32 in [0, 1] or NaN.
-        never_shaded: (H, W), no difference between L and S.
+        never_reached: (H, W), from `without_holes`.
         hidden: (H, W), the figure is in front.
 
     Returns:
@@ -208,7 +208,7 @@ def fill_beta(beta: Float32, never_shaded: Bool, hidden: Bool, fill: Fill) -> Fl
     if fill == "lit":
         filled[np.isnan(filled)] = 1
         return filled
-    filled[never_shaded & ~_small(never_shaded)] = 1
+    filled[never_reached] = 1
     # A pixel that was never shaded is no source to continue a shadow from only where it is itself
     # unknown; where it was set to 1 above it is as good as measured.
     filled[hidden] = np.nan
@@ -234,9 +234,12 @@ def inpaint(image: Float32) -> Float32:
     return fill_membrane(values[..., np.newaxis], known.astype(np.float32))[..., 0]
 
 
-def _small(mask: Bool) -> Bool:
-    """The connected parts of a mask that are small enough to be called holes."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-    small = stats[:, cv2.CC_STAT_AREA] <= _LARGEST_HOLE * mask.size
-    small[0] = False
-    return np.asarray(small[labels])
+def without_holes(never_shaded: Bool) -> Bool:
+    """Of the pixels, (H, W), without a difference between L and S the large connected regions,
+    which the shadow never reached in the whole take."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        never_shaded.astype(np.uint8), connectivity=8
+    )
+    large = stats[:, cv2.CC_STAT_AREA] > _LARGEST_HOLE * never_shaded.size
+    large[0] = False
+    return np.asarray(large[labels])

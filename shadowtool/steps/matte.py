@@ -12,6 +12,7 @@ from shadowtool.choices import Beta, Fill, Gain, Only
 from shadowtool.core import beta as shadow_beta
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.exposure import frame_gain, without_gain
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.holdout import grid_step, on_grid
 from shadowtool.core.matting import HIDDEN, Figure, colour_figure, pull_figure, without_figure
 from shadowtool.core.noise import NoiseModel
@@ -142,6 +143,7 @@ class _Scene:
         backdrop: the same without NaN.
         unknown: (H, W), a plate is NaN.
         never_shaded: (H, W), β can't be known.
+        never_reached: (H, W), nor is it a hole in what is.
         contrasts: (H, W) for each plane of β.
         confidence: (H, W), of β where it is measured.
         step, reference: the grid and its lit colours that exposure is measured by.
@@ -151,6 +153,7 @@ class _Scene:
     backdrop: Backdrop
     unknown: Bool
     never_shaded: Bool
+    never_reached: Bool
     contrasts: list[Float32]
     confidence: Float32
     step: int
@@ -179,7 +182,10 @@ class _Scene:
         if plates.shadow_frames is not None:
             doubt[plates.shadow_frames == 0] = _GUESSED
         backdrop = Backdrop(lit, shadow, noise, doubt)
-        return cls(plates, backdrop, unknown, never_shaded, contrasts, confidence, step, reference)
+        reached = shadow_beta.without_holes(never_shaded)
+        return cls(
+            plates, backdrop, unknown, never_shaded, reached, contrasts, confidence, step, reference
+        )
 
 
 class _Shown(NamedTuple):
@@ -262,14 +268,15 @@ class _Take:
 
     def _shown(self, frame: Frame) -> _Shown:
         stored = self.footage.image(frame)
-        image = stored.rgb(self.footage.transfer).astype(np.float32)
+        image = to_float(stored.rgb(self.footage.transfer))
         finite = np.isfinite(image)
         bad = ~(finite[..., 0] & finite[..., 1] & finite[..., 2])
-        image[bad] = np.nan
+        if bad.any():
+            image = np.where(bad[..., np.newaxis], np.float32(np.nan), image)
         gain = 1.0
         if self.gain == "auto":
             gain = frame_gain(on_grid(image, self.scene.step), self.scene.reference)
-        image = without_gain(image, gain).astype(np.float32)
+        image = without_gain(image, gain).astype(np.float32, copy=False)
         return _Shown(image, stored.header, gain, int(bad.sum()))
 
     def _figure(self, frame: Frame, image: Float32) -> Figure:
@@ -299,7 +306,7 @@ class _Take:
             known = shadow_beta.without_noise(known, contrast)
             known = np.clip(known, 0, 1) if self.clamp else known
             unknown |= np.isnan(known)
-            filled.append(shadow_beta.fill_beta(known, scene.never_shaded, hidden, self.fill))
+            filled.append(shadow_beta.fill_beta(known, scene.never_reached, hidden, self.fill))
         return filled[0] if self.beta == "scalar" else np.stack(filled, axis=-1), unknown
 
 

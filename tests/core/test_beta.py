@@ -10,6 +10,7 @@ from shadowtool.core.beta import (
     shadow_contrast,
     shadow_matte,
     unknown_beta,
+    without_holes,
 )
 from shadowtool.core.compositing import shade
 from shadowtool.core.noise import NoiseModel
@@ -111,7 +112,7 @@ def test_filling_none_keeps_what_is_unknown() -> None:
 
 def test_inpainting_continues_holes_and_lights_what_no_shadow_reached() -> None:
     beta, never, hidden = holes()
-    filled = fill_beta(beta, never, hidden, "inpaint")
+    filled = fill_beta(beta, without_holes(never), hidden, "inpaint")
     assert filled[31, 31] == pytest.approx(0.25, abs=0.02)
     assert filled[40:43, 44:46] == pytest.approx(0.25, abs=0.02)
     assert (filled[:, 70:] == 1).all()

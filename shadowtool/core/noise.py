@@ -161,6 +161,10 @@ def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
         if own:
             values = np.array([max(level.value, 0.0) for level in own])
             variances = np.array([level.sigma**2 for level in own])
+            # Noise grows with brightness. Where it seems not to, what was compared moved: dark
+            # pixels may be none but those that a soft shadow is passing.
+            for i in range(len(own) - 1):
+                variances[i] = min(variances[i], float(np.median(variances[i + 1 :])))
             slope[channel], floor[channel] = _non_negative_line(values, variances)
             # In the dark, rounding counts most, and the line must not pass below it.
             darkest = float(variances[0] - slope[channel] * values[0])

@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from shadowtool.core.noise import (
+    NoiseLevel,
     NoiseModel,
     NoiseSamples,
     extreme_range,
@@ -99,3 +102,22 @@ def test_pure_noise_stays_within_the_range_of_extremes() -> None:
     for count in (10, 100, 400):
         ranges = np.ptp(rng.normal(size=(count, 4000)), axis=0)
         assert (ranges < extreme_range(count)).mean() > 0.995
+
+
+def test_dark_levels_in_which_all_moved_do_not_raise_the_noise() -> None:
+    clean = [
+        NoiseLevel(channel, value, 0.01 * np.sqrt(value + 0.02))
+        for channel in range(3)
+        for value in np.linspace(0.05, 0.9, 12)
+    ]
+    moved = [
+        replace(level, sigma=0.06) if level.value < 0.3 else level  # a soft shadow's flank
+        for level in clean
+    ]
+    dark = np.full((1, 3), 0.05, np.float32)
+    sigma, wrong = (noise_model(levels).sigma(dark) for levels in (clean, moved))
+    assert sigma == pytest.approx(0.01 * np.sqrt(0.07), rel=0.02)
+    assert (wrong < 4 * sigma).all()
+    # Clipped lights without noise do not lower it either.
+    clipped = [replace(level, sigma=0.0) if level.value > 0.85 else level for level in clean]
+    assert noise_model(clipped).sigma(dark) == pytest.approx(sigma, rel=0.3)

@@ -47,8 +47,8 @@ _KEPT_BYTES, _LEAST_KEPT, _MOST_KEPT = 2**28, 6, 24
 # Half the widths of the windows in which times are taken for linear, pixels.
 _RADII = (2, 5)
 _WINDOWS = Windows(_RADII)
-# Less than this part of the usual contrast is that of a pixel in shade.
-_SHADE = 0.3
+# Less than this part of the usual loss of light is that of a pixel in shade.
+SHADE = 0.3
 
 
 @dataclass(frozen=True)
@@ -376,24 +376,26 @@ def refined_times(
     return np.clip(fitted, at - 1, at).astype(np.float32), spread
 
 
-def without_shade(contrast: Float32, highest: Float32, known: Bool, plane: Bool) -> Bool:
-    """Which of the known pixels the key light reaches at all.
+def usual_loss(contrast: Float32, highest: Float32, known: Bool, plane: Bool) -> Float32:
+    """What part of its light each pixel loses to the stick, against what is usual on the plane.
 
-    In shade of its own a pixel still loses some sky to the stick, at another time than it would
-    lose the key light: its contrast is a small part of its brightness. How large a part it is in
-    the light is seen on the reference plane.
+    In shade of its own a pixel still loses some sky, at another time than it would lose the key
+    light: below `SHADE` it counts as shade. Where a stick blocks the key light only in part, the
+    middle of what is lost comes at another time than the edge: such times are to be trusted less.
 
     Args:
         contrast, highest: (H, W), I_max - I_min and I_max.
         known, plane: (H, W), where there is a time; the reference plane region.
+
+    Returns:
+        (H, W) float32 in [0, 1]; all 1 if nothing is known on the plane.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        part = contrast / highest
+        part = np.nan_to_num(contrast / highest, posinf=0.0, neginf=0.0)
     usual = part[plane & known]
     if not usual.size:
-        return known
-    with np.errstate(invalid="ignore"):
-        return np.asarray(known & ~(part < _SHADE * np.median(usual)))
+        return np.ones(contrast.shape, np.float32)
+    return np.asarray(np.clip(part / max(float(np.median(usual)), 1e-6), 0, 1), np.float32)
 
 
 def _least_caught(part: Float32) -> float:

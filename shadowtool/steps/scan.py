@@ -20,6 +20,7 @@ from shadowtool.core.shadow_lines import (
     zero_crossings,
 )
 from shadowtool.core.shadow_time import (
+    SHADE,
     CrossingFinder,
     Crossings,
     ShadowTimes,
@@ -28,7 +29,7 @@ from shadowtool.core.shadow_time import (
     refined_times,
     significant,
     time_windows,
-    without_shade,
+    usual_loss,
 )
 from shadowtool.core.warp_map import Pass
 from shadowtool.errors import DamagedFileError, InputError, ReshootError
@@ -172,8 +173,10 @@ def _times(
     """Times and errors, each pixel's own and as its neighbours tell them too."""
     own, own_error = own_times(crossings, noise)
     contrast = np.nan_to_num(crossings.highest - crossings.lowest)
-    lit = without_shade(contrast, crossings.highest, np.isfinite(own), region)
-    own, own_error = np.where(lit, own, np.nan), np.where(lit, own_error, np.inf)
+    loss = usual_loss(contrast, crossings.highest, np.isfinite(own), region)
+    lit = np.isfinite(own) & (loss >= SHADE)
+    own = np.where(lit, own, np.float32(np.nan))
+    own_error = np.where(lit, own_error / np.maximum(loss, SHADE) ** 2, np.float32(np.inf))
     time, error = np.empty_like(own), np.empty_like(own_error)
     windows = time_windows(own, region)
 

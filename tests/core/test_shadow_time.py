@@ -7,6 +7,7 @@ from shadowtool.core.noise import NoiseModel
 from shadowtool.core.shadow_time import (
     INTERVAL_ERROR,
     LEAST_CONTRAST,
+    SHADE,
     CrossingFinder,
     Crossings,
     interpolated_times,
@@ -14,7 +15,7 @@ from shadowtool.core.shadow_time import (
     own_times,
     refined_times,
     significant,
-    without_shade,
+    usual_loss,
 )
 from tests.scene import Scene, Sweep
 
@@ -218,13 +219,16 @@ def test_refined_times_stay_between_their_frames_and_unknown_ones_unknown() -> N
     assert (refined[known] <= index[known]).all() and (refined[known] >= index[known] - 1).all()
 
 
-def test_what_loses_only_sky_to_the_stick_has_no_time() -> None:
+def test_what_loses_only_sky_to_the_stick_is_told_from_what_loses_the_key_light() -> None:
     highest = np.ones((10, 10), np.float32)
     contrast = np.full((10, 10), 0.8, np.float32)
     contrast[:3] = 0.1
+    contrast[3] = 0.4
     known = np.ones((10, 10), bool)
     plane = np.zeros((10, 10), bool)
     plane[5:] = True
-    lit = without_shade(contrast, highest, known, plane)
-    assert not lit[:3].any() and lit[3:].all()
-    assert without_shade(contrast, highest, known, ~known).all()
+    loss = usual_loss(contrast, highest, known, plane)
+    assert (loss[:3] < SHADE).all()
+    assert loss[3] == pytest.approx(0.5)
+    assert (loss[4:] == 1).all()
+    assert (usual_loss(contrast, highest, known, ~known) == 1).all()

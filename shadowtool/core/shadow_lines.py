@@ -64,14 +64,11 @@ class NoLinesError(ValueError):
     """The reference plane shows too little of the sweep to fit lines."""
 
 
-def fit_shadow_lines(
-    time: NDArray[np.float32], plane: NDArray[np.bool_], frames: Float64
-) -> ShadowLines:
+def fit_shadow_lines(groups: dict[int, Float64], frames: Float64) -> ShadowLines:
     """Fit, reject and replace the shadow lines of one pass.
 
     Args:
-        time: (H, W) shadow times, frame numbers; NaN unknown.
-        plane: (H, W) bool, the reference plane region.
+        groups: points on the edge, pixels, by frame, from `zero_crossings`.
         frames: (N,) ascending numbers of the frames that were looked at.
 
     Returns:
@@ -80,11 +77,6 @@ def fit_shadow_lines(
     Raises:
         NoLinesError: fewer than two frames have a usable line.
     """
-    return fit_lines(zero_crossings(time, plane, frames), frames)
-
-
-def fit_lines(groups: dict[int, Float64], frames: Float64) -> ShadowLines:
-    """`fit_shadow_lines` to points that `zero_crossings` found."""
     fitted = {i: _fit(points) for i, points in groups.items() if len(points) >= _LEAST_POINTS}
     fits = {i: line for i, line in fitted.items() if line is not None}
     if len(fits) < 2:
@@ -183,7 +175,7 @@ def line_bend(
     that no straight line takes up is left in the residuals, and it has the same k in all lines.
 
     Args:
-        groups, frames: as for `fit_lines`.
+        groups, frames: as for `fit_shadow_lines`.
         lines: what that made of them.
         size: of the picture, (W, H).
     """
@@ -219,6 +211,11 @@ def zero_crossings(
     time: NDArray[np.float32], plane: NDArray[np.bool_], frames: Float64
 ) -> dict[int, Float64]:
     """Points where t - f changes its sign between neighbouring pixels, for each frame f.
+
+    Args:
+        time: (H, W) shadow times, frame numbers; NaN unknown.
+        plane: (H, W) bool, the reference plane region.
+        frames: (N,) ascending numbers of the frames that were looked at.
 
     Returns:
         By index into ``frames``: (P, 2) float64 points (x, y), interpolated between the pixels'

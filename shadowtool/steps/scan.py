@@ -14,7 +14,7 @@ from shadowtool.core.shadow_lines import (
     Bend,
     NoLinesError,
     ShadowLines,
-    fit_lines,
+    fit_shadow_lines,
     line_bend,
     line_speed,
     zero_crossings,
@@ -69,7 +69,7 @@ def scan(
     run: Run = Run(),
     transfer: str = "auto",
 ) -> Result:
-    """Write ``scan.exr`` (time, contrast), ``lines.json`` and a picture of both.
+    """Write ``scan.exr`` (times, their errors, contrast), ``lines.json`` and a picture of both.
 
     Args:
         plane: the reference plane region: a mask image (above half is inside), or a polygon
@@ -109,7 +109,7 @@ def scan(
     times = _times(crossings, noise, region, numbers, run.jobs)
     points = zero_crossings(times.time, region, numbers)
     try:
-        lines = fit_lines(points, numbers)
+        lines = fit_shadow_lines(points, numbers)
     except NoLinesError as error:
         raise ReshootError(
             f"{footage.sequence.pattern}: reshoot: {error}; sweep the shadow across the plane,"

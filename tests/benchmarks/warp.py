@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from shadowtool.core.diffusion import diffuse
-from shadowtool.core.shadow_lines import fit_shadow_lines, line_speed
+from shadowtool.core.shadow_lines import fit_shadow_lines, line_speed, zero_crossings
 from shadowtool.core.shadow_time import (
     CrossingFinder,
     ShadowTimes,
@@ -65,7 +65,8 @@ def paper_map(scene: str) -> WarpMap:
         # The paper leaves out pixels of low contrast: here, below a tenth of the usual.
         low = contrast < 0.1 * np.median(contrast)
         time = np.where(low, np.float32(np.nan), interpolated_times(crossings))
-        lines = fit_shadow_lines(time, region, np.arange(len(numbers), dtype=np.float64))
+        count = np.arange(len(numbers), dtype=np.float64)
+        lines = fit_shadow_lines(zero_crossings(time, region, count), count)
         passes.append(Pass(ShadowTimes.alone(time, contrast), lines))
     speeds = [line_speed(one.lines, region.shape) for one in passes]
     return diffuse(intersect(passes, speeds), 40)

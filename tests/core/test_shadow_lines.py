@@ -5,7 +5,6 @@ from shadowtool.core.shadow_lines import (
     Bend,
     NoLinesError,
     ShadowLines,
-    fit_lines,
     fit_shadow_lines,
     interpolate_lines,
     line_bend,
@@ -32,9 +31,13 @@ def edge_times(sweep: Sweep) -> np.ndarray:
     return low.astype(np.float32)
 
 
+def lines_of(time: np.ndarray, plane: np.ndarray, frames: np.ndarray) -> ShadowLines:
+    return fit_shadow_lines(zero_crossings(time, plane, frames), frames)
+
+
 def fitted(sweep: Sweep, time: np.ndarray | None = None) -> ShadowLines:
     frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
-    return fit_shadow_lines(edge_times(sweep) if time is None else time, SCENE.plane, frames)
+    return lines_of(edge_times(sweep) if time is None else time, SCENE.plane, frames)
 
 
 def errors(lines: ShadowLines, sweep: Sweep) -> np.ndarray:
@@ -86,7 +89,7 @@ def test_frames_need_not_be_one_apart() -> None:
     count = SCENE.frames_of(sweep)
     frames = np.arange(count, dtype=np.float64)
     time = (edge_times(sweep) * 2 + 1001).astype(np.float32)
-    doubled = fit_shadow_lines(time, SCENE.plane, frames * 2 + 1001)
+    doubled = lines_of(time, SCENE.plane, frames * 2 + 1001)
     assert doubled.offset == pytest.approx(whole.offset, abs=1e-2)
 
 
@@ -148,11 +151,11 @@ def test_times_outside_the_sweep_have_no_line() -> None:
 def test_a_plane_that_no_edge_crosses_is_refused() -> None:
     nothing = np.full((SCENE.height, SCENE.width), np.nan, np.float32)
     with pytest.raises(NoLinesError):
-        fit_shadow_lines(nothing, SCENE.plane, np.arange(30.0))
+        lines_of(nothing, SCENE.plane, np.arange(30.0))
     tiny = np.zeros_like(SCENE.plane)
     tiny[10:12, 10:12] = True
     with pytest.raises(NoLinesError):
-        fit_shadow_lines(edge_times(Sweep(0.3)), tiny, np.arange(60.0))
+        lines_of(edge_times(Sweep(0.3)), tiny, np.arange(60.0))
 
 
 def bowed(sweep: Sweep, strength: float) -> np.ndarray:
@@ -169,7 +172,7 @@ def bowed(sweep: Sweep, strength: float) -> np.ndarray:
 
 def bend_of(time: np.ndarray, plane: np.ndarray, frames: np.ndarray) -> Bend:
     points = zero_crossings(time, plane, frames)
-    return line_bend(points, frames, fit_lines(points, frames), (SCENE.width, SCENE.height))
+    return line_bend(points, frames, fit_shadow_lines(points, frames), (SCENE.width, SCENE.height))
 
 
 @pytest.mark.parametrize("angle", [0.2, 1.4, 2.6])

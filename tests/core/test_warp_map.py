@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowtool.core.shadow_lines import fit_shadow_lines, line_speed
+from shadowtool.core.shadow_lines import line_speed
 from shadowtool.core.shadow_time import ShadowTimes
 from shadowtool.core.warp_map import (
     Pass,
@@ -16,7 +16,7 @@ from shadowtool.core.warp_map import (
     resample,
     to_st_map,
 )
-from tests.core.test_shadow_lines import SCENE, edge_times
+from tests.core.test_shadow_lines import SCENE, edge_times, lines_of
 from tests.scene import Sweep
 
 ANGLES = (0.2, 1.3, 2.4)
@@ -28,7 +28,7 @@ def passes(angles: tuple[float, ...] = ANGLES) -> list[Pass]:
         sweep = Sweep(angle)
         time = edge_times(sweep)
         frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
-        lines = fit_shadow_lines(time, SCENE.plane, frames)
+        lines = lines_of(time, SCENE.plane, frames)
         result.append(Pass(ShadowTimes.alone(time, np.ones_like(time), 0.02), lines))
     return result
 

@@ -179,9 +179,15 @@ def _solve(
         figures["source"] = _figures(source, own, own_epipole)
         onward = invert(diffuse(own, iterations))
         measured = compose(result, onward)
+        seen = float(np.isfinite(measured.error).mean())
+        if seen < _LEAST_KNOWN:
+            raise ReshootError(
+                f"{output}: reshoot: the source's sweeps ({', '.join(source.names)}) show only"
+                f" {seen:.1%} of the ground that the target's frame needs; let them cross the same"
+            )
         # Ground that the source's camera doesn't see is filled in from around it.
         result = diffuse(measured, 0)
-        figures["source"]["seen"] = round(float(np.isfinite(measured.error).mean()), 4)
+        figures["source"]["seen"] = round(seen, 4)
     provenance = recipe.provenance(mark)
     make_folder(output)
     write_warp(output / WARP, result, target.header, provenance)

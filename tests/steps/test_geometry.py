@@ -8,7 +8,7 @@ import pytest
 from shadowtool.core.warp_map import identity_map
 from shadowtool.errors import OptionError, ReshootError
 from shadowtool.io.image import Header, to_half, write_exr, write_png
-from shadowtool.io.products import WARP, read_scan, read_warp
+from shadowtool.io.products import WARP, read_scan, read_warp, write_scan
 from shadowtool.steps.run import Run
 from shadowtool.steps.scan import scan
 from shadowtool.steps.warp import warp
@@ -107,6 +107,29 @@ def test_parallel_source_scans_are_to_be_shot_again(scans: list[Path], tmp_path:
     with pytest.raises(ReshootError, match="degrees apart"):
         warp(scans, tmp_path, source_scans=[scans[0], scans[0]])
     assert not any(tmp_path.iterdir())
+
+
+def test_a_source_that_shows_none_of_the_targets_ground_is_to_be_shot_again(
+    scans: list[Path], tmp_path: Path
+) -> None:
+    halves = {"left": slice(0, 70), "right": slice(90, None)}
+    sets: dict[str, list[Path]] = {}
+    for name, kept in halves.items():
+        for folder in scans:
+            seen, header, _ = read_scan(folder)
+            hidden = np.ones(seen.times.time.shape, bool)
+            hidden[:, kept] = False
+            for times in (seen.times.time, seen.times.own_time):
+                times[hidden] = np.nan
+            for errors in (seen.times.error, seen.times.own_error):
+                errors[hidden] = np.inf
+            part = tmp_path / name / folder.name
+            part.mkdir(parents=True)
+            write_scan(part, seen, header, {})
+            sets.setdefault(name, []).append(part)
+    with pytest.raises(ReshootError, match="source's sweeps"):
+        warp(sets["left"], tmp_path / "warp", source_scans=sets["right"])
+    assert not (tmp_path / "warp").exists()
 
 
 def test_sweeps_that_hardly_meet_are_to_be_shot_again(tmp_path: Path, mask: str) -> None:

@@ -10,6 +10,7 @@ import threading
 import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from shadowtool.errors import InputError, RetryError, ShadowtoolError
@@ -249,6 +250,26 @@ def test_a_folder_that_cannot_be_made_is_refused(place, tmp_path):
 def test_fingerprints_tell_contents_apart(tmp_path):
     contents = [b"", b"\0", b"\0\0", b"a", b"b", b"ab", b"ba"]
     assert len({fingerprint(content) for content in contents}) == len(contents)
+
+
+@pytest.mark.parametrize("size", [1, 32_791, 32_792, 32_793, 100_000, 1_000_003])
+def test_a_fingerprint_tells_of_any_byte(size):
+    content = np.random.default_rng(size).integers(0, 256, size, np.uint8)
+    marks = {fingerprint(content.tobytes())}
+    places = {0, size // 3, size // 2, size - 1}
+    for place in places:
+        content[place] ^= 0x10
+        marks.add(fingerprint(content.tobytes()))
+    assert len(marks) == 1 + len(places)
+
+
+@pytest.mark.parametrize("row", [8, 4096, 1920 * 2, 1920 * 6, 4096 * 12 + 8, 65536])
+def test_a_fingerprint_tells_of_rows_that_changed_places(row):
+    rows = np.random.default_rng(0).integers(0, 256, (1_000_000 // row, row), np.uint8)
+    for other in (1, 2, len(rows) // 2, len(rows) - 1):
+        swapped = rows.copy()
+        swapped[[0, other]] = swapped[[other, 0]]
+        assert fingerprint(swapped.tobytes()) != fingerprint(rows.tobytes())
 
 
 def test_a_files_fingerprint_is_its_contents(tmp_path):

@@ -8,19 +8,32 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.half_floats import all_finite
-
 Int16 = NDArray[np.int16]
 Float32 = NDArray[np.float32]
 
 # Below this exponent halfs are evenly spaced.
 _LEAST_EXPONENT = -14
 _SIGN = np.int16(-0x8000)
+# Keys of finite halfs are below this, and not below minus this.
+_INFINITE = 0x7C00
 
 
 def to_keys(halfs: NDArray[np.float16]) -> Int16:
     """Integers in the order of the halfs; -0 comes just below 0, NaN beyond infinity."""
     return _folded(np.ascontiguousarray(halfs).view(np.int16))
+
+
+def finite_keys(halfs: NDArray[np.float16]) -> tuple[Int16, NDArray[np.bool_] | None]:
+    """`to_keys` of (H, W, 3), and where a channel is NaN or infinite, (H, W); None for nowhere."""
+    bits = np.ascontiguousarray(halfs).view(np.uint16)
+    if bits.max(initial=0) < _INFINITE:
+        # Neither a sign among them nor more than the largest half.
+        return bits.view(np.int16), None
+    keys = _folded(bits.view(np.int16))
+    if keys.max() < _INFINITE and keys.min() >= -_INFINITE:
+        return keys, None
+    bad = (keys >= _INFINITE) | (keys < -_INFINITE)
+    return keys, np.asarray(bad.any(axis=-1), bool)
 
 
 def from_keys(keys: Int16) -> NDArray[np.float16]:
@@ -77,11 +90,3 @@ def gray_keys(keys: Int16) -> Int16:
     # OpenCV knows unsigned integers only; the weights add up to 1, so an offset stays the same.
     above = (keys ^ _SIGN).view(np.uint16)
     return np.asarray(cv2.cvtColor(above, cv2.COLOR_RGB2GRAY)).view(np.int16) ^ _SIGN
-
-
-def not_finite(halfs: NDArray[np.float16]) -> NDArray[np.bool_] | None:
-    """Where a channel is NaN or infinite, (H, W) for (H, W, 3); None for nowhere."""
-    if all_finite(halfs):
-        return None
-    magnitude = np.ascontiguousarray(halfs).view(np.uint16) & np.uint16(0x7FFF)
-    return np.asarray((magnitude >= 0x7C00).any(axis=-1), bool)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
 from shadowtool.core.half_floats import to_float
-from shadowtool.core.half_keys import from_keys, not_finite, to_keys
+from shadowtool.core.half_keys import finite_keys, from_keys
 
 Float32 = NDArray[np.float32]
 
@@ -50,7 +50,9 @@ class ExtremePlates:
     def __init__(self) -> None:
         self._lowest: NDArray[np.int16] | Float32 | None = None
         self._highest: NDArray[np.int16] | Float32 | None = None
-        self._frames: NDArray[np.uint32] | None = None
+        self._frames = 0
+        # In how many of them each pixel was not seen; None while all were in all.
+        self._missed: NDArray[np.uint32] | None = None
 
     def add(self, image: NDArray[np.floating], holdout: NDArray[np.number] | None = None) -> None:
         """Take one frame in.
@@ -63,34 +65,38 @@ class ExtremePlates:
         Raises:
             ValueError: the shape differs from that of the first frame.
         """
-        if self._lowest is None or self._highest is None or self._frames is None:
+        if self._lowest is None or self._highest is None:
             # For halfs the integers that stand for infinity: both survive going over to floats.
-            infinity = _order_keys(np.full((1, 1, 3), np.inf, image.dtype))
+            infinity, _ = _order_keys(np.full((1, 1, 3), np.inf, image.dtype))
             top = infinity[0, 0, 0]
             bottom = ~top if infinity.dtype == np.int16 else -top
             self._lowest = np.full(image.shape, top, infinity.dtype)
             self._highest = np.full(image.shape, bottom, infinity.dtype)
-            self._frames = np.zeros(image.shape[:2], np.uint32)
         if image.shape != self._lowest.shape:
             raise ValueError(f"a frame of {image.shape} among frames of {self._lowest.shape}")
         mixed = (image.dtype == np.float16) != (self._lowest.dtype == np.int16)
         if mixed:
             # Halfs and floats in one take: go on in float, which holds every half.
             self._lowest, self._highest = _values(self._lowest), _values(self._highest)
+        self._frames += 1
         for rows in bands(image.shape):
-            keys = _order_keys(image[rows])
+            keys, out = _order_keys(image[rows])
             keys = _values(keys) if mixed else keys
             lowest, highest = self._lowest[rows], self._highest[rows]
-            seen = seen_pixels(image[rows], None if holdout is None else holdout[rows])
-            if seen is None:
+            if holdout is not None:
+                # NaN in a matte says nothing in favour of the pixel.
+                held = np.asarray(~(holdout[rows] <= 0))
+                out = held if out is None else held | out
+            if out is None or not out.any():
                 np.minimum(lowest, keys, out=lowest)
                 np.maximum(highest, keys, out=highest)
-                self._frames[rows] += np.uint32(1)
             else:
-                mask = seen.view(np.uint8)
+                mask = (~out).view(np.uint8)
                 cv2.copyTo(np.minimum(lowest, keys), mask, lowest)
                 cv2.copyTo(np.maximum(highest, keys), mask, highest)
-                self._frames[rows] += seen
+                if self._missed is None:
+                    self._missed = np.zeros(image.shape[:2], np.uint32)
+                self._missed[rows] += out
 
     def plates(self) -> Plates:
         """The plates so far.
@@ -98,41 +104,30 @@ class ExtremePlates:
         Raises:
             ValueError: no frame was added.
         """
-        if self._lowest is None or self._highest is None or self._frames is None:
+        if self._lowest is None or self._highest is None:
             raise ValueError("no frame was added")
-        unseen = self._frames == 0
         lit, shadow = _values(self._highest), _values(self._lowest)
-        if unseen.any():
+        frames = np.full(lit.shape[:2], self._frames, np.uint32)
+        if self._missed is not None:
+            frames -= self._missed
+            unseen = frames == 0
             lit[unseen] = np.nan
             shadow[unseen] = np.nan
-        return Plates(lit, shadow, self._frames.copy())
+        return Plates(lit, shadow, frames)
 
 
-def _order_keys(image: NDArray[np.floating]) -> NDArray[np.int16] | Float32:
-    """Values that compare as the image's do: int16 for halfs, float32 else."""
-    if image.dtype != np.float16:
-        return np.asarray(image, np.float32)
-    return to_keys(image.astype(np.float16, copy=False))
+def _order_keys(
+    image: NDArray[np.floating],
+) -> tuple[NDArray[np.int16] | Float32, NDArray[np.bool_] | None]:
+    """Values that compare as the image's do, int16 for halfs and float32 else, and where a channel
+    is not finite, None for nowhere."""
+    if image.dtype == np.float16:
+        return finite_keys(image.astype(np.float16, copy=False))
+    wrong = ~np.isfinite(image)
+    return np.asarray(image, np.float32), np.asarray(wrong.any(axis=-1)) if wrong.any() else None
 
 
 def _values(keys: NDArray[np.int16] | Float32) -> Float32:
     if keys.dtype == np.int16:
         return to_float(from_keys(keys.astype(np.int16, copy=False)))
     return keys.astype(np.float32)
-
-
-def seen_pixels(
-    image: NDArray[np.floating], holdout: NDArray[np.number] | None
-) -> NDArray[np.bool_] | None:
-    """Where the frame shows the background, or None for everywhere."""
-    if image.dtype == np.float16:
-        bad = not_finite(image.astype(np.float16, copy=False))
-    else:
-        wrong = ~np.isfinite(image)
-        bad = np.asarray(wrong.any(axis=-1)) if wrong.any() else None
-    seen = None if bad is None else ~bad
-    if holdout is not None:
-        # NaN in a matte says nothing in favour of the pixel.
-        free = np.asarray(holdout <= 0)
-        seen = free if seen is None else seen & free
-    return seen

@@ -162,7 +162,7 @@ def plate(
         yield confidence, plate_layers(output, plates, contrast)[confidence]
 
     def write(item: tuple[Path, dict[str, NDArray[np.float32]]]) -> None:
-        write_exr(item[0], item[1], footage.header, provenance)
+        write_exr(item[0], item[1], footage.header, provenance, quick=True)
 
     for _ in ordered_map(write, products(), run.jobs):
         pass

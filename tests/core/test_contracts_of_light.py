@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from shadowtool.core import beta, camera_motion, compositing, exposure, filling, half_keys, noise
 from shadowtool.core.half_floats import all_finite, to_float, to_half
 from shadowtool.core.holdout import grid_step
-from shadowtool.core.plates import ExtremePlates, Plates, seen_pixels
+from shadowtool.core.plates import ExtremePlates, Plates
 from shadowtool.core.transfer import TRANSFERS
 from tests.core.contracts import (
     TAME,
@@ -96,15 +96,13 @@ CONTRACTS = {
         lambda h, w: st.tuples(plane(h, w, TAME)),
         lambda r, a: is_single(r, *a.shape) and (r > 0).all(),
     ),
-    "not_finite": Contract(
-        half_keys.not_finite,
+    "finite_keys": Contract(
+        half_keys.finite_keys,
         lambda h, w: st.tuples(halfs(h, w)),
-        lambda r, a: np.array_equal(unknown(a), np.zeros(a.shape[:2], bool) if r is None else r),
-    ),
-    "seen_pixels": Contract(
-        seen_pixels,
-        lambda h, w: st.tuples(st.one_of(halfs(h, w), picture(h, w)), plane(h, w)),
-        lambda r, a, m: np.array_equal(r, ~unknown(a) & (m <= 0)),
+        lambda r, a: (
+            np.array_equal(half_keys.from_keys(r[0]).view("i2"), a.view("i2"))
+            and np.array_equal(unknown(a), np.zeros(a.shape[:2], bool) if r[1] is None else r[1])
+        ),
     ),
     "extremes of halfs": Contract(
         extremes,

@@ -5,11 +5,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from shadowtool.core.half_keys import (
+    finite_keys,
     from_keys,
     gray_keys,
     keys_per_unit,
     mean_of_keys,
-    not_finite,
     to_keys,
 )
 
@@ -152,11 +152,20 @@ def test_gray_keys_climb_with_every_channel(one: np.ndarray, other: np.ndarray) 
     assert (gray_keys(to_keys(low)) <= gray_keys(to_keys(high))).all()
 
 
-def test_what_is_not_finite_is_so_in_any_channel() -> None:
+@pytest.mark.parametrize("values", [POSITIVE, FINITE, -POSITIVE])
+def test_what_is_not_finite_is_so_in_any_channel(values: np.ndarray) -> None:
     rng = np.random.default_rng(0)
-    halfs = rng.choice(FINITE, (60, 70, 3))
-    assert not_finite(halfs) is None
-    for bad in (np.nan, -np.nan, np.inf, -np.inf):
-        halfs[rng.random(halfs.shape) < 0.03] = bad
-    for part in (halfs, halfs[:, ::2], halfs[::-1]):
-        assert np.array_equal(not_finite(part), ~np.isfinite(part).all(axis=-1))
+    halfs = rng.choice(values, (60, 70, 3))
+    keys, bad = finite_keys(halfs)
+    assert np.array_equal(keys, to_keys(halfs)) and bad is None
+    for wrong in (np.nan, -np.nan, np.inf, -np.inf):
+        halfs[rng.random(halfs.shape) < 0.03] = wrong
+        for part in (halfs, halfs[:, ::2], halfs[::-1]):
+            keys, bad = finite_keys(part)
+            assert np.array_equal(keys, to_keys(part))
+            assert np.array_equal(bad, ~np.isfinite(part).all(axis=-1))
+
+
+def test_the_keys_of_nothing_are_nothing() -> None:
+    keys, bad = finite_keys(np.zeros((0, 5, 3), np.float16))
+    assert keys.shape == (0, 5, 3) and bad is None

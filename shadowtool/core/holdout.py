@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.color_line import Weighed, channels, line_distance
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
@@ -48,7 +49,7 @@ def grid_step(width: int, height: int) -> int:
 
 def on_grid(image: NDArray[np.floating], step: int) -> Float32:
     """The grid's pixels of a frame, (H, W, 3) to (h, w, 3) float32."""
-    return np.ascontiguousarray(image[::step, ::step], np.float32)
+    return to_float(np.ascontiguousarray(image[::step, ::step]))
 
 
 @dataclass(frozen=True)

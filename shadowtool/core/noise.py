@@ -188,7 +188,7 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
         count = len(difference) // _LEVELS
         spread = np.empty((4, _LEVELS, 3))
         for channel in range(3):
-            order = np.argsort(brighter[:, channel], kind="stable")
+            order = _ascending(brighter[:, channel])
             rows = order[: count * _LEVELS].reshape(_LEVELS, count)
             own = difference[rows, channel]
             middle, quantile = np.quantile(own, (0.5, part[0]), axis=1)
@@ -199,6 +199,14 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
             spread[3, :, channel] = _code_steps(first[usable][rows, channel])
         spreads.append(spread)
     return spreads
+
+
+def _ascending(values: Float32) -> NDArray[np.int64]:
+    """The stable order of finite values (N,), by a sort of what cannot tie: many times faster."""
+    # Adding 0 makes one zero of the two.
+    bits = (values + np.float32(0)).view(np.int32)
+    keys = (bits ^ ((bits >> 31) & np.int32(0x7FFFFFFF))).astype(np.int64)
+    return np.sort(keys << 32 | np.arange(len(keys))) & 0xFFFFFFFF
 
 
 def _code_steps(values: Float32) -> Float32:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import to_float, to_half
 from shadowtool.core.plates import Plates
 from shadowtool.core.shadow_lines import ShadowLines
 from shadowtool.core.shadow_time import ShadowTimes
@@ -98,10 +99,14 @@ def plate_layers(
     folder: Path, plates: Plates, contrast: NDArray[np.float32]
 ) -> dict[Path, dict[str, NDArray[np.float32]]]:
     """What is to be written for plates: layers by file; lit, shadow and confidence (channels
-    contrast, frames, and shadow_frames for plates that are not extremes)."""
+    contrast, frames, and shadow_frames for plates that are not extremes).
+
+    Of the contrast as many digits are kept as a half has: the others say nothing, and take up most
+    of the room.
+    """
     lit, shadow, confidence = plate_files(folder)
     frames = plates.frames if plates.frames is not None else np.zeros(contrast.shape)
-    layers = {"contrast": contrast, "frames": frames.astype(np.float32)}
+    layers = {"contrast": to_float(to_half(contrast)), "frames": frames.astype(np.float32)}
     if plates.shadow_frames is not None:
         layers["shadow_frames"] = plates.shadow_frames.astype(np.float32)
     return {lit: {"RGB": plates.lit}, shadow: {"RGB": plates.shadow}, confidence: layers}

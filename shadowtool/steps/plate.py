@@ -58,6 +58,7 @@ HOLDOUT_FOLDER = "holdout"
 # Sampled frames are kept for the second reading up to so many bytes.
 _KEPT = 192 << 20
 _NOTHING = np.zeros((0, 0, 3), np.float16)
+_NO_GRID = np.zeros((0, 0, 3), np.float32)
 
 
 def plate(
@@ -193,7 +194,7 @@ class _Shown(NamedTuple):
     """A frame and what is to be left out of it.
 
     ``keys`` is for the robust estimator alone: with no ``values`` in its last reading, with the
-    gray keys only before.
+    gray keys only before. ``grid`` is empty where nobody asks for it.
     """
 
     values: NDArray[np.floating]
@@ -270,7 +271,8 @@ class _Take:
                 else:
                     image = self.footage.image(frame)
                     values, mark = image.rgb(self.footage.transfer), image.fingerprint
-                grid = self.grid(values)
+                needed = not last or self.reference is not None or self.background is not None
+                grid = self.grid(values) if needed else _NO_GRID
                 gain = self.gain(grid)
                 if gain != 1:
                     values = without_gain(values, gain)

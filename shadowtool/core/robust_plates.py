@@ -15,19 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.half_keys import (
+    finite_keys,
     from_keys,
     gray_keys,
     keys_per_unit,
     mean_of_keys,
-    to_keys,
 )
 from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
 Int16 = NDArray[np.int16]
-Int32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.intp]
+Window = tuple[slice, slice]
 
 # A sample of this many frames tells the lit level.
 SAMPLES = 24
@@ -44,10 +44,10 @@ _GROUP, _SHADE = 4.0, 0.25
 _LEAST_GROUP = 3
 # The gray key of what is not seen, above and below that of all that is.
 _UNSEEN, _LOWEST_KEY = np.int16(32767), np.int16(-32000)
-# Keys of finite halfs are from minus this to one less.
-_INFINITE = 0x7C00
 # So many rows at a time stay in the processor's cache.
 _ROWS = 32
+# Where more than this part of a window is darkened, all of it is gone through.
+_DENSE = 0.12
 
 
 class Keyed(NamedTuple):
@@ -71,19 +71,17 @@ def keyed(image: NDArray[np.floating], holdout: NDArray[np.number] | None = None
     halfs = np.ascontiguousarray(halfs, np.float16)
     keys = halfs.view(np.int16)
     gray = np.empty(keys.shape[:2], np.int16)
-    # Halfs are their own keys if none is negative.
-    same = keys.min() >= 0
-    if not same:
-        keys = np.empty_like(keys)
+    copied = False
     for start in range(0, len(keys), _ROWS):
         rows = slice(start, start + _ROWS)
-        if not same:
-            keys[rows] = to_keys(halfs[rows])
-        gray[rows] = gray_keys(keys[rows])
-    low, high, _, _ = cv2.minMaxLoc(keys.reshape(1, -1))
-    if low < -_INFINITE or high >= _INFINITE:
-        finite = (keys >= -_INFINITE) & (keys < _INFINITE)
-        hide(gray, np.asarray(~finite.all(axis=-1)))
+        own, bad = finite_keys(halfs[rows])
+        if own.min() < 0:
+            # Halfs are their own keys where none is negative.
+            keys = keys if copied else keys.copy()
+            keys[rows], copied = own, True
+        gray[rows] = gray_keys(own)
+        if bad is not None:
+            hide(gray[rows], bad)
     if holdout is not None:
         # NaN in a matte says nothing in favour of the pixel.
         hide(gray, np.asarray(~(holdout <= 0)))
@@ -104,12 +102,14 @@ class LitLevels:
 
     def add(self, gray: Int16) -> None:
         """Take in the gray keys of one of the sample's frames, (H, W)."""
-        gray = gray.copy()
-        gray[gray == _UNSEEN] = _LOWEST_KEY
-        for held in self._highest:
-            lower = np.minimum(held, gray)
-            np.maximum(held, gray, out=held)
-            gray = lower
+        for start in range(0, len(gray), _ROWS):
+            rows = slice(start, start + _ROWS)
+            own = np.where(gray[rows] == _UNSEEN, _LOWEST_KEY, gray[rows])
+            for highest in self._highest:
+                held = highest[rows]
+                lower = np.minimum(held, own)
+                np.maximum(held, own, out=held)
+                own = lower
 
     def levels(self) -> Int16:
         """(H, W) keys; where fewer frames than that saw the pixel, the lowest of those."""
@@ -135,43 +135,81 @@ class Measured:
     shadow_frames: NDArray[np.uint32]
 
 
-class _Group:
-    """For each pixel a group of frames that agree.
+class _Members(NamedTuple):
+    """Groups of frames, one of each of N pixels.
 
     Attributes:
-        planes: (5, N) int32: the number of frames, the bits of their mean gray as a float32, and
-            the sums of their channels' keys. Gray is counted from so far up that it is negative:
+        count: (N,) float32, the number of frames.
+        gray: (N,) float32, the mean of their gray keys, counted from so far up that it is negative:
             a group of none, all 0, lies above every frame.
+        total: (N, 3) float32, the sums of their channels' keys.
     """
 
-    def __init__(self, pixels: int) -> None:
-        self.planes = np.zeros((5, pixels), np.int32)
+    count: Float32
+    gray: Float32
+    total: Float32
 
-    def put(self, where: Index, planes: Int32) -> None:
-        """Let pixels start with these planes."""
-        for held, new in zip(self.planes, planes, strict=True):
+    def take(self, which: Index) -> "_Members":
+        return _Members(*(values.take(which, axis=0) for values in self))
+
+
+class _Group:
+    """For each pixel of a picture a group of frames that agree: the fields of `_Members`."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self.count = np.zeros((height, width), np.float32)
+        self.gray = np.zeros((height, width), np.float32)
+        self.total = np.zeros((height, width, 3), np.float32)
+        self._flat = _Members(self.count.ravel(), self.gray.ravel(), self.total.reshape(-1, 3))
+
+    def at(self, where: Index) -> _Members:
+        return self._flat.take(where)
+
+    def put(self, where: Index, members: _Members) -> None:
+        """Let pixels start with these."""
+        for held, new in zip(self._flat, members, strict=True):
             held[where] = new
 
-    def add(self, where: Index, single: Int32, width: Float32) -> tuple[Index, Index, Int32]:
+    def join(self, window: Window, frame: Keyed, dark: Bool, width: Float32) -> Bool:
+        """Let the dark pixels of a window found groups, or join those within a width of them.
+
+        Returns:
+            Which of them are left.
+        """
+        count, gray = self.count[window], self.gray[window]
+        distance = _below(frame.gray[window])
+        distance -= gray
+        joining = np.abs(distance) <= width[window]
+        joining |= count == 0
+        joining &= dark
+        count += joining
+        distance *= joining
+        distance /= np.maximum(count, 1)
+        gray += distance
+        _accumulate(frame.keys[window], self.total[window], joining.view(np.uint8))
+        return dark & ~joining
+
+    def add(self, where: Index, single: _Members, width: Float32) -> tuple[Index, Index, _Members]:
         """Let groups of one join those within a width of them, or replace brighter ones.
 
         Returns:
-            Which of them lie above and are left out; which replaced a group, and that one's planes.
+            Which of them lie above and are left out; which replaced a group, and that group.
         """
-        held = self.planes.take(where, axis=1)
-        count, mean = held[0], held[1].view(np.float32)
-        distance = single[1].view(np.float32) - mean
-        apart = np.flatnonzero(np.abs(distance) > width)
-        above = distance.take(apart) > 0
-        before = held.take(apart, axis=1)
+        distance = single.gray - self._flat.gray.take(where)
+        near = np.abs(distance) <= width
+        joining, above = np.flatnonzero(near), np.flatnonzero(~near & (distance > 0))
+        place = where.take(joining)
+        count, gray, total = self.at(place)
         count += 1
-        distance /= count.astype(np.float32)
-        mean += distance
-        held[2:] += single[2:]
-        held[:, apart] = np.where(above, before, single.take(apart, axis=1))
-        self.put(where, held)
-        below = ~above & (before[0] > 0)
-        return apart[above], apart[below], before[:, below]
+        gray += distance.take(joining) / count
+        total += single.total.take(joining, axis=0)
+        self.put(place, _Members(count, gray, total))
+        below = np.flatnonzero(~near & (distance < 0))
+        place = where.take(below)
+        replaced = self.at(place)
+        self.put(place, single.take(below))
+        known = np.flatnonzero(replaced.count)
+        return above, below.take(known), replaced.take(known)
 
 
 class RobustPlates:
@@ -179,77 +217,108 @@ class RobustPlates:
 
     def __init__(self, levels: Int16, noise: NoiseModel) -> None:
         """Args: the lit levels of the first reading, (H, W), and the take's noise."""
-        unsampled = levels == _LOWEST_KEY
-        values = np.maximum(np.nan_to_num(from_keys(levels).astype(np.float32), posinf=65504), 0)
-        self._sigma_at = _KeySigma(noise)
-        sigma = self._sigma_at(values)
-        middle = levels - _THIRD_HIGHEST * sigma
-        self._lit_low = _to_int16(middle - _LIT * sigma)
-        self._lit_high = _to_int16(middle + _LIT * sigma)
-        self._dark = _to_int16(middle - _DARK * sigma)
-        # Of a pixel that no sample showed, whatever frame does is taken.
-        self._lit_low[unsampled], self._lit_high[unsampled] = _LOWEST_KEY, _UNSEEN - 1
-        self._dark[unsampled] = _LOWEST_KEY
-        # The noise of a shadow is that of a fraction of the light; which one hardly matters.
-        shaded = np.maximum(values * np.float32(_SHADE), np.float32(1e-4))
-        self._width = (_GROUP * self._sigma_at(shaded)).ravel()
-        pixels = levels.size
-        self._shape = levels.shape
-        self._total = np.zeros((*levels.shape, 3), np.int32)
+        bits = np.ascontiguousarray(levels).view(np.uint16)
+        tables = _thresholds(noise)
+        low, high, dark, width = (np.asarray(cv2.LUT(bits, table)) for table in tables)
+        self._lit_low, self._lit_high, self._dark, self._width = low, high, dark, width
+        self._total = np.zeros((*levels.shape, 3), np.float32)
         self._count = np.zeros(levels.shape, np.int32)
-        self._lowest, self._next = _Group(pixels), _Group(pixels)
+        self._lowest, self._next = _Group(*levels.shape), _Group(*levels.shape)
 
     def add(self, frame: Keyed) -> None:
         """Take in one frame; frames come in the order of the take."""
-        lit = np.asarray(cv2.inRange(frame.gray, self._lit_low, self._lit_high), np.uint8)
-        cv2.add(self._total, frame.keys, dst=self._total, mask=lit, dtype=cv2.CV_32S)
-        # As signed bytes the mask's 255 are -1.
-        np.subtract(self._count, lit.view(np.int8), out=self._count)
         for start in range(0, len(frame.gray), _ROWS):
-            self._darken(frame, slice(start, start + _ROWS))
+            rows = slice(start, start + _ROWS)
+            gray = frame.gray[rows]
+            lit = np.asarray(cv2.inRange(gray, self._lit_low[rows], self._lit_high[rows]), np.uint8)
+            _accumulate(frame.keys[rows], self._total[rows], lit)
+            # As signed bytes the mask's 255 are -1.
+            self._count[rows] -= lit.view(np.int8)
+            self._darken(frame, rows)
 
     def _darken(self, frame: Keyed, rows: slice) -> None:
         """Let the darkened pixels of some rows, groups of one, join, found or pass over groups."""
-        gray = frame.gray[rows]
-        dark = np.flatnonzero(gray < self._dark[rows])
-        if not dark.size:
+        dark = frame.gray[rows] < self._dark[rows]
+        columns = np.flatnonzero(dark.any(axis=0))
+        if not columns.size:
             return
-        single = np.empty((5, dark.size), np.int32)
-        single[0] = 1
-        single[1] = (gray.ravel().take(dark) - np.float32(_UNSEEN)).view(np.int32)
-        single[2:] = frame.keys[rows].reshape(-1, 3).take(dark, axis=0).T
-        where = dark + rows.start * gray.shape[1]
-        width = self._width.take(where)
+        window = rows, slice(int(columns[0]), int(columns[-1]) + 1)
+        part = dark[:, window[1]]
+        if np.count_nonzero(part) > _DENSE * part.size:
+            # Most join, and are quickest added where they stand.
+            part[:] = self._lowest.join(window, frame, part, self._width)
+        where = rows.start * dark.shape[1] + np.flatnonzero(dark)
+        if not where.size:
+            return
+        single = _Members(
+            np.ones(where.size, np.float32),
+            _below(frame.gray.ravel().take(where)),
+            frame.keys.reshape(-1, 3).take(where, axis=0).astype(np.float32),
+        )
+        width = self._width.ravel().take(where)
         above, below, replaced = self._lowest.add(where, single, width)
         self._next.put(where.take(below), replaced)
-        self._next.add(where.take(above), single.take(above, axis=1), width.take(above))
+        self._next.add(where.take(above), single.take(above), width.take(above))
 
     def measured(self) -> Measured:
         """The plates so far."""
-        shape = self._shape
+        shape = self._count.shape
         lit = np.empty((*shape, 3), np.float32)
         shadow = np.full((*shape, 3), np.nan, np.float32)
-        lit_frames, shadow_frames = np.empty(shape, np.uint32), np.zeros(shape, np.uint32)
+        lit_frames, shadow_frames = self._count.astype(np.uint32), np.zeros(shape, np.uint32)
         for start in range(0, shape[0], _ROWS):
             rows = slice(start, start + _ROWS)
             lit[rows] = mean_of_keys(self._total[rows], self._count[rows][..., None])
-            lit_frames[rows] = self._count[rows]
-            first = start * shape[1]
-            where = first + np.flatnonzero(self._lowest.planes[0, first : first + _ROWS * shape[1]])
-            lowest, backup = (
-                group.planes.take(where, axis=1) for group in (self._lowest, self._next)
-            )
+            where = start * shape[1] + np.flatnonzero(self._lowest.count[rows])
+            lowest, backup = self._lowest.at(where), self._next.at(where)
             # A group of one or two frames below a much larger one is a bird, not the shadow.
-            stray = (lowest[0] < _LEAST_GROUP) & (backup[0] >= 2 * lowest[0])
-            group = np.where(stray, backup, lowest)
-            shadow.reshape(-1, 3)[where] = mean_of_keys(group[2:], group[0]).T
-            shadow_frames.ravel()[where] = group[0]
+            stray = (lowest.count < _LEAST_GROUP) & (backup.count >= 2 * lowest.count)
+            count = np.where(stray, backup.count, lowest.count)
+            total = np.where(stray[:, None], backup.total, lowest.total)
+            shadow.reshape(-1, 3)[where] = mean_of_keys(total, count[:, None])
+            shadow_frames.ravel()[where] = count
         # Never at its lit level: what it was all the time is all that is known of it.
         never = (lit_frames == 0) & (shadow_frames > 0)
         if never.any():
             lit[never] = shadow[never]
             lit_frames[never] = shadow_frames[never]
         return Measured(lit, shadow, lit_frames, shadow_frames)
+
+
+def _below(gray: Int16) -> Float32:
+    """Gray keys counted from that of the unseen, negative."""
+    return np.asarray(gray - np.float32(_UNSEEN), np.float32)
+
+
+def _accumulate(keys: Int16, total: Float32, mask: NDArray[np.uint8]) -> None:
+    """Add keys (H, W, 3) to sums where a mask is not 0.
+
+    Single floats hold the sums of 500 frames exactly, and are added to several times faster than
+    integers of their size; of thousands they are off by a hundredth of a key.
+    """
+    if keys.min() >= 0:
+        cv2.accumulate(keys.view(np.uint16), total, mask)
+    else:
+        cv2.add(total, keys, dst=total, mask=mask, dtype=cv2.CV_32F)
+
+
+def _thresholds(noise: NoiseModel) -> tuple[Int16, Int16, Int16, Float32]:
+    """By the bits of a lit level's key: the least and the highest key of what is lit, the one
+    below which it is darkened, and how far a frame may be from the group that it belongs to."""
+    levels = np.arange(1 << 16, dtype=np.uint16).view(np.int16)
+    unsampled = levels == _LOWEST_KEY
+    values = np.maximum(np.nan_to_num(from_keys(levels).astype(np.float32), posinf=65504), 0)
+    sigma_at = _KeySigma(noise)
+    sigma = sigma_at(values)
+    middle = levels - _THIRD_HIGHEST * sigma
+    low, high = _to_int16(middle - _LIT * sigma), _to_int16(middle + _LIT * sigma)
+    dark = _to_int16(middle - _DARK * sigma)
+    # Of a pixel that no sample showed, whatever frame does is taken.
+    low[unsampled], high[unsampled] = _LOWEST_KEY, _UNSEEN - 1
+    dark[unsampled] = _LOWEST_KEY
+    # The noise of a shadow is that of a fraction of the light; which one hardly matters.
+    shaded = np.maximum(values * np.float32(_SHADE), np.float32(1e-4))
+    return low, high, dark, _GROUP * sigma_at(shaded)
 
 
 class _KeySigma:

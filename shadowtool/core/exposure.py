@@ -31,10 +31,10 @@ def frame_gain(image: Float32, reference: Float32) -> float:
     Returns:
         The most frequent ratio of the two; 1 if it is next to 1, or nothing agrees.
     """
-    now, then = image.sum(axis=-1), reference.sum(axis=-1)
+    now, then = _sum(image), _sum(reference)
     usable = np.isfinite(now) & np.isfinite(then) & (then > 1e-2) & (now > 0)
     ratio = np.log(now[usable] / then[usable])
-    near = ratio[np.abs(ratio) < _WIDEST]
+    near = np.sort(ratio[np.abs(ratio) < _WIDEST])
     if near.size < max(_LEAST_PART * usable.sum(), 16):
         return 1.0
     counts, edges = np.histogram(near, bins=140, range=(-_WIDEST, _WIDEST))
@@ -44,12 +44,19 @@ def frame_gain(image: Float32, reference: Float32) -> float:
     agreed = near[np.abs(near - centre) < _NEAR[0]]
     for width in _NEAR:
         members = near[np.abs(near - centre) < width]
-        centre = float(np.median(members)) if members.size else centre
+        # Their median, as they are in order.
+        middle = members[(members.size - 1) // 2 : members.size // 2 + 1]
+        centre = float(middle.mean()) if middle.size else centre
     # What agrees is many, and many more than if the ratios were anything at all.
     enough = max(_LEAST_PART * usable.sum(), 2 * near.size * _NEAR[0] / _WIDEST)
     if agreed.size < enough or abs(centre) < _NOTHING:
         return 1.0
     return float(np.exp(centre))
+
+
+def _sum(image: Float32) -> Float32:
+    """Of the channels, (h, w); several times faster than along so short an axis."""
+    return np.asarray(image[..., 0] + image[..., 1] + image[..., 2], np.float32)
 
 
 def common_reference(samples: list[Float32]) -> Float32:

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import to_float
+
 Int16 = NDArray[np.int16]
 Float32 = NDArray[np.float32]
 
@@ -62,13 +64,14 @@ def mean_of_keys(total: NDArray[np.integer], count: NDArray[np.integer]) -> Floa
     none = count == 0
     mean = np.divide(total, np.maximum(count, 1), dtype=np.float64).astype(np.float32)
     low = np.floor(mean)
-    part = mean - low
+    mean -= low
     keys = low.astype(np.int16)
-    below = from_keys(keys).astype(np.float32)
+    below = to_float(from_keys(keys))
     keys += np.int16(1)
-    above = np.minimum(from_keys(keys).astype(np.float32), np.float32(65504))
+    above = to_float(from_keys(keys))
+    np.minimum(above, np.float32(65504), out=above)
     above -= below
-    above *= part
+    above *= mean
     below += above
     if none.any():
         below[np.broadcast_to(none, below.shape)] = np.nan

@@ -66,7 +66,7 @@ def _level(gray: Float32, frames: NDArray[np.uint32]) -> Bool:
 def _ratio_field(
     lit: Float32, shadow: Float32, gray: Float32, level: Bool, plane: Bool | None
 ) -> tuple[Float32, float] | None:
-    where = np.flatnonzero(_opened(level if plane is None else level & plane))
+    where = _looked_at(_opened(level if plane is None else level & plane))
     if where.size < 50:
         return None
     own = gray.ravel().take(where)
@@ -202,6 +202,18 @@ def _cell(shape: tuple[int, ...]) -> int:
     return max(_LEAST_CELL, round(max(shape) / _CELLS))
 
 
+def _step(shape: tuple[int, ...]) -> int:
+    """Every how many rows and columns of a coarse cell are looked at; some 64 points do."""
+    return max(1, _cell(shape) // 8)
+
+
+def _looked_at(mask: Bool) -> NDArray[np.intp]:
+    """Places of a picture that are in the mask, as many as are looked at."""
+    step = _step(mask.shape)
+    rows, columns = np.nonzero(mask[::step, ::step])
+    return np.asarray(rows * (step * mask.shape[1]) + columns * step, np.intp)
+
+
 def _smooth(ratio: Float32, where: NDArray[np.intp], shape: tuple[int, ...]) -> Float32:
     """Log ratios (N, 3) at these places of a picture, averaged over an eighth of it and continued
     everywhere; (h, w, 3), by coarse cells."""
@@ -209,9 +221,10 @@ def _smooth(ratio: Float32, where: NDArray[np.intp], shape: tuple[int, ...]) -> 
     height, width = (-(-size // cell) for size in shape)
     rows, columns = np.divmod(where, shape[1])
     place = rows // cell * width + columns // cell
+    part = (_step(shape) / cell) ** 2
     planes = [
         np.bincount(place, values, height * width).reshape(height, width).astype(np.float32)
-        for values in (np.full(len(where), 1 / cell**2), *(ratio.T / np.float32(cell**2)))
+        for values in (np.full(len(where), part), *(ratio.T * np.float32(part)))
     ]
     sigma = max(height, width) / 16
     blurred, *sums = (

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from shadowtool.choices import Estimator, Gain, Missing
 from shadowtool.core.beta import shadow_contrast
 from shadowtool.core.exposure import common_reference, frame_gain, without_gain
+from shadowtool.core.half_floats import shortened
 from shadowtool.core.holdout import (
     Background,
     figure_mask,
@@ -55,8 +56,9 @@ logger = logging.getLogger(__name__)
 Bool = NDArray[np.bool_]
 
 HOLDOUT_FOLDER = "holdout"
-# Sampled frames are kept for the second reading up to so many bytes.
-_KEPT = 192 << 20
+# Sampled frames are kept for the second reading up to so many bytes, as far as these with what the
+# estimate takes for each pixel stay below a gigabyte.
+_KEPT, _WITH_ESTIMATE, _PER_PIXEL = 400 << 20, 1000 << 20, 100
 _NOTHING = np.zeros((0, 0, 3), np.float16)
 _NO_GRID = np.zeros((0, 0, 3), np.float32)
 
@@ -352,7 +354,8 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     thinned: dict[int, NDArray[np.float32]] = {}
     grids: dict[Frame, NDArray[np.float32]] = {}
     grays: dict[Frame, NDArray[np.int16]] = {}
-    free = _KEPT
+    width, height = take.footage.header.size
+    free = min(_KEPT, _WITH_ESTIMATE - _PER_PIXEL * width * height)
     for count, item in enumerate(take.shown(chosen, with_keys=False, last=False)):
         take.run.progress(count, len(positions) + len(frames))
         if item is None:
@@ -376,7 +379,6 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         take.background = find_background(level, noise)
     if take.background is not None:
         make_folder(take.folder)
-    width, height = take.footage.header.size
     levels = LitLevels(height, width)
     if with_levels:
         # The others, that were kept or whose exposure is off, are keyed now that all is known.
@@ -423,10 +425,12 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
     sampled = _sample(take, frames, automatic, with_levels=True)
     noise = sampled.noise
     found = _measured(take, frames, sampled)
+    lit = shortened(found.lit)
 
     def complete() -> tuple[Plates, Figures]:
-        completed = complete_shadow(found.lit, found.shadow, found.shadow_frames, noise, region)
-        plates = Plates(found.lit, completed.shadow, found.lit_frames, found.shadow_frames)
+        completed = complete_shadow(lit, found.shadow, found.shadow_frames, noise, region)
+        shadow = shortened(completed.shadow)
+        plates = Plates(lit, shadow, found.lit_frames, found.shadow_frames)
         seen = found.lit_frames > 0
         reading = "a plane that a shadow crossed" if completed.partial else "a scene under a card"
         figures: Figures = {
@@ -437,7 +441,7 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         }
         return plates, figures
 
-    return _Estimate(found.lit, noise, complete)
+    return _Estimate(lit, noise, complete)
 
 
 def _measured(take: _Take, frames: list[Frame], sampled: _Samples) -> Measured:

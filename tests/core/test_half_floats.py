@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shadowtool.core.half_floats import all_finite, rounded, to_float, to_half
+from shadowtool.core.half_floats import all_finite, rounded, shortened, to_float, to_half
 
 EVERY_HALF = np.arange(1 << 16, dtype=np.uint32).astype(np.uint16).view(np.float16)
 SHAPES = [(1,), (4,), (1, 1), (4, 1), (1, 4), (4, 1, 3), (2, 2, 4), (3, 3, 7), (0, 3), (2, 3, 2, 2)]
@@ -84,3 +84,15 @@ def test_rounding_alone_makes_infinities(bits):
 def test_single_floats_are_not_copied():
     values = np.ones((2, 2), np.float32)
     assert to_float(values) is values
+
+
+@given(hnp.arrays(np.float32, st.sampled_from(SHAPES), elements=st.floats(-1e4, 1e4, width=32)))
+def test_what_is_shortened_is_off_by_a_sixteenth_of_a_halfs_step(values):
+    normal = np.where(np.abs(values) < 1e-30, np.float32(0), values)
+    short = shortened(normal)
+    assert (np.abs(short - normal) <= 2.0**-14 * np.abs(normal)).all()
+    assert not (short.view(np.uint32) & 0x3FF).any()
+
+
+def test_every_half_stays_as_it_is_when_shortened():
+    assert same_bits(shortened(to_float(EVERY_HALF)), to_float(EVERY_HALF))

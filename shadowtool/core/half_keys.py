@@ -51,7 +51,7 @@ def _folded(bits: Int16) -> Int16:
     return bits
 
 
-def mean_of_keys(total: NDArray[np.integer], count: NDArray[np.integer]) -> Float32:
+def mean_of_keys(total: NDArray[np.number], count: NDArray[np.number]) -> Float32:
     """The values that sums of keys stand for, with fractions of a key kept.
 
     The mean of keys is the mean of values where these differ by little: off by a hundredth of

@@ -139,13 +139,13 @@ class _Members(NamedTuple):
     """Groups of frames, one of each of N pixels.
 
     Attributes:
-        count: (N,) float32, the number of frames.
+        frames: (N,) float32, how many they are.
         gray: (N,) float32, the mean of their gray keys, counted from so far up that it is negative:
             a group of none, all 0, lies above every frame.
         total: (N, 3) float32, the sums of their channels' keys.
     """
 
-    count: Float32
+    frames: Float32
     gray: Float32
     total: Float32
 
@@ -157,10 +157,10 @@ class _Group:
     """For each pixel of a picture a group of frames that agree: the fields of `_Members`."""
 
     def __init__(self, height: int, width: int) -> None:
-        self.count = np.zeros((height, width), np.float32)
+        self.frames = np.zeros((height, width), np.float32)
         self.gray = np.zeros((height, width), np.float32)
         self.total = np.zeros((height, width, 3), np.float32)
-        self._flat = _Members(self.count.ravel(), self.gray.ravel(), self.total.reshape(-1, 3))
+        self._flat = _Members(self.frames.ravel(), self.gray.ravel(), self.total.reshape(-1, 3))
 
     def at(self, where: Index) -> _Members:
         return self._flat.take(where)
@@ -176,15 +176,15 @@ class _Group:
         Returns:
             Which of them are left.
         """
-        count, gray = self.count[window], self.gray[window]
+        frames, gray = self.frames[window], self.gray[window]
         distance = _below(frame.gray[window])
         distance -= gray
         joining = np.abs(distance) <= width[window]
-        joining |= count == 0
+        joining |= frames == 0
         joining &= dark
-        count += joining
+        frames += joining
         distance *= joining
-        distance /= np.maximum(count, 1)
+        distance /= np.maximum(frames, 1)
         gray += distance
         _accumulate(frame.keys[window], self.total[window], joining.view(np.uint8))
         return dark & ~joining
@@ -199,16 +199,16 @@ class _Group:
         near = np.abs(distance) <= width
         joining, above = np.flatnonzero(near), np.flatnonzero(~near & (distance > 0))
         place = where.take(joining)
-        count, gray, total = self.at(place)
-        count += 1
-        gray += distance.take(joining) / count
+        frames, gray, total = self.at(place)
+        frames += 1
+        gray += distance.take(joining) / frames
         total += single.total.take(joining, axis=0)
-        self.put(place, _Members(count, gray, total))
+        self.put(place, _Members(frames, gray, total))
         below = np.flatnonzero(~near & (distance < 0))
         place = where.take(below)
         replaced = self.at(place)
         self.put(place, single.take(below))
-        known = np.flatnonzero(replaced.count)
+        known = np.flatnonzero(replaced.frames)
         return above, below.take(known), replaced.take(known)
 
 
@@ -219,11 +219,14 @@ class RobustPlates:
         """Args: the lit levels of the first reading, (H, W), and the take's noise."""
         bits = np.ascontiguousarray(levels).view(np.uint16)
         tables = _thresholds(noise)
-        low, high, dark, width = (np.asarray(cv2.LUT(bits, table)) for table in tables)
-        self._lit_low, self._lit_high, self._dark, self._width = low, high, dark, width
-        self._total = np.zeros((*levels.shape, 3), np.float32)
-        self._count = np.zeros(levels.shape, np.int32)
-        self._lowest, self._next = _Group(*levels.shape), _Group(*levels.shape)
+        self._lit_low, self._lit_high, self._dark, near = (
+            np.asarray(cv2.LUT(bits, table)) for table in tables
+        )
+        self._near = np.asarray(near, np.float32)
+        height, width = levels.shape
+        self._total = np.zeros((height, width, 3), np.float32)
+        self._count = np.zeros((height, width), np.int32)
+        self._lowest, self._next = _Group(height, width), _Group(height, width)
 
     def add(self, frame: Keyed) -> None:
         """Take in one frame; frames come in the order of the take."""
@@ -246,7 +249,7 @@ class RobustPlates:
         part = dark[:, window[1]]
         if np.count_nonzero(part) > _DENSE * part.size:
             # Most join, and are quickest added where they stand.
-            part[:] = self._lowest.join(window, frame, part, self._width)
+            part[:] = self._lowest.join(window, frame, part, self._near)
         where = rows.start * dark.shape[1] + np.flatnonzero(dark)
         if not where.size:
             return
@@ -255,7 +258,7 @@ class RobustPlates:
             _below(frame.gray.ravel().take(where)),
             frame.keys.reshape(-1, 3).take(where, axis=0).astype(np.float32),
         )
-        width = self._width.ravel().take(where)
+        width = self._near.ravel().take(where)
         above, below, replaced = self._lowest.add(where, single, width)
         self._next.put(where.take(below), replaced)
         self._next.add(where.take(above), single.take(above), width.take(above))
@@ -269,11 +272,11 @@ class RobustPlates:
         for start in range(0, shape[0], _ROWS):
             rows = slice(start, start + _ROWS)
             lit[rows] = mean_of_keys(self._total[rows], self._count[rows][..., None])
-            where = start * shape[1] + np.flatnonzero(self._lowest.count[rows])
+            where = start * shape[1] + np.flatnonzero(self._lowest.frames[rows])
             lowest, backup = self._lowest.at(where), self._next.at(where)
             # A group of one or two frames below a much larger one is a bird, not the shadow.
-            stray = (lowest.count < _LEAST_GROUP) & (backup.count >= 2 * lowest.count)
-            count = np.where(stray, backup.count, lowest.count)
+            stray = (lowest.frames < _LEAST_GROUP) & (backup.frames >= 2 * lowest.frames)
+            count = np.where(stray, backup.frames, lowest.frames)
             total = np.where(stray[:, None], backup.total, lowest.total)
             shadow.reshape(-1, 3)[where] = mean_of_keys(total, count[:, None])
             shadow_frames.ravel()[where] = count

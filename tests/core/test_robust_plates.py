@@ -301,7 +301,7 @@ def test_groups_are_those_of_each_pixel_by_itself(seed: int) -> None:
             group = slow_darkest(
                 [int(f.gray[y, x]) for f in dark],
                 [f.keys[y, x].astype(np.int32) for f in dark],
-                plates._width[y, x],
+                plates._near[y, x],
             )
             if group is None:
                 assert found.shadow_frames[y, x] == 0

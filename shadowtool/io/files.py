@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import io
 import itertools
 import os
 import socket
@@ -25,6 +26,8 @@ _HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
 _SAMPLE, _SAMPLES = 1 << 16, 256
 # A prime number of words: no row of pixels, and no page, is a multiple of it.
 _FOLD = 4099
+# Bytes that are read at a time.
+_BLOCK = 8 * 8 * _FOLD
 _counter = itertools.count()
 
 
@@ -77,12 +80,112 @@ def read_bytes(path: Path) -> bytes:
         InputError: it isn't there, is no file, or may not be read.
         RetryError: the machine failed, not the file.
     """
-    try:
+    with _reading(path):
         return path.read_bytes()
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise translated(error, path, "read") from None
+
+
+class Stream:
+    """A file that passes through memory once, to be decoded and fingerprinted on the way.
+
+    Reads go forward block by block; what lies behind the block is read once more.
+    """
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file = file
+        self._size = os.fstat(file.fileno()).st_size
+        self._block = memoryview(bytearray(_BLOCK))
+        self._start = self._length = self._place = 0
+        self._ended = False
+        self._checksum = _Checksum()
+        self.fault: OSError | None = None
+
+    def read(self, size: int) -> bytes:
+        """At most so many bytes; ``fault`` keeps an error, as OpenEXR passes it on as another."""
+        parts = []
+        try:
+            while size > 0:
+                offset = self._place - self._start
+                if offset < 0:
+                    part = os.pread(self._file.fileno(), min(size, -offset), self._place)
+                elif offset < self._length:
+                    part = bytes(self._block[offset : min(offset + size, self._length)])
+                elif not self._ended:
+                    self._advance()
+                    continue
+                else:
+                    break
+                if not part:
+                    break
+                parts.append(part)
+                self._place += len(part)
+                size -= len(part)
+        except OSError as error:
+            self.fault = error
+            raise
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._place = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._place}.get(whence, self._size)
+        return self._place
+
+    def tell(self) -> int:
+        return self._place
+
+    def fingerprint(self) -> str:
+        """The `fingerprint` of all of it; reads what has not been yet."""
+        while not self._ended:
+            self._advance()
+        return self._checksum.result()
+
+    def _advance(self) -> None:
+        self._start += self._length
+        self._length = 0
+        while self._length < _BLOCK:
+            count = self._file.readinto(self._block[self._length :])
+            if not count:
+                self._ended = True
+                break
+            self._length += count
+        self._checksum.add(self._block[: self._length])
+
+
+class HeldStream(io.BytesIO):
+    """What `reading_once` holds, to be read like a `Stream`."""
+
+    def __init__(self, content: Content) -> None:
+        super().__init__(content.data)
+        self._fingerprint = content.fingerprint
+
+    def fingerprint(self) -> str:
+        return self._fingerprint
+
+
+@contextlib.contextmanager
+def open_stream(path: Path) -> Iterator[Stream | HeldStream]:
+    """Open a file for decoding. Raises as `read_bytes`, also for what OpenEXR has met in it."""
+    if path in _held.contents:
+        yield HeldStream(_held.contents[path])
+        return
+    with _reading(path):
+        file = io.FileIO(path)
+    with file:
+        stream = Stream(file)
+        try:
+            with _reading(path):
+                yield stream
+        finally:
+            if stream.fault is not None:
+                raise translated(stream.fault, path, "read") from None
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
@@ -173,15 +276,34 @@ def fingerprint(data: bytes) -> str:
     It tells whether an input changed between two runs, not whether somebody forged it. The CRC-32
     is that of the content folded to 32 kB by exclusive or, which takes a fifth of the time.
     """
-    words = np.frombuffer(data, np.uint64, len(data) // (8 * _FOLD) * _FOLD)
-    folded = np.bitwise_xor.reduce(words.reshape(-1, _FOLD), axis=0)
-    rest = memoryview(data)[words.nbytes :]
-    return f"{len(data)}:{zlib.crc32(rest, zlib.crc32(folded)):08x}"
+    checksum = _Checksum()
+    checksum.add(data)
+    return checksum.result()
+
+
+class _Checksum:
+    """A `fingerprint` in the making."""
+
+    def __init__(self) -> None:
+        self._folded = np.zeros(_FOLD, np.uint64)
+        self._rest = b""
+        self._size = 0
+
+    def add(self, data: bytes | memoryview) -> None:
+        """Take in the next bytes; a multiple of the fold's but for the last."""
+        words = np.frombuffer(data, np.uint64, len(data) // (8 * _FOLD) * _FOLD)
+        self._folded ^= np.bitwise_xor.reduce(words.reshape(-1, _FOLD), axis=0)
+        self._rest = bytes(memoryview(data)[words.nbytes :])
+        self._size += len(data)
+
+    def result(self) -> str:
+        return f"{self._size}:{zlib.crc32(self._rest, zlib.crc32(self._folded.tobytes())):08x}"
 
 
 def fingerprint_file(path: Path) -> str:
     """The `fingerprint` of a file's content. Raises as `read_bytes`."""
-    return fingerprint(read_bytes(path))
+    with open_stream(path) as stream:
+        return stream.fingerprint()
 
 
 def fingerprint_movie(path: Path) -> str:

@@ -27,7 +27,14 @@ from shadowtool.core.half_floats import to_float
 from shadowtool.core.half_floats import to_half as to_half
 from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import DamagedFileError, InputError, ShadowtoolError
-from shadowtool.io.files import Content, read_content, write_bytes
+from shadowtool.io.files import (
+    Content,
+    HeldStream,
+    Stream,
+    open_stream,
+    read_content,
+    write_bytes,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -250,10 +257,10 @@ def read_image(path: Path) -> Image:
         InputError: as `read_header`.
         DamagedFileError: cut off, or the pixels don't decode.
     """
-    content = read_content(path)
     if path.suffix.lower() == PNG:
-        return _decode_png(path, content)
-    return _decode_exr(path, content)
+        return _decode_png(path, read_content(path))
+    with open_stream(path) as stream:
+        return _decode_exr(path, stream)
 
 
 def write_exr(
@@ -373,7 +380,7 @@ def to_code(linear: NDArray[np.floating], transfer: str = "srgb") -> NDArray[np.
 
 
 def _open_exr(
-    path: Path, source: BinaryIO, header_only: bool = False, separate: bool = False
+    path: Path, source: BinaryIO | Stream, header_only: bool = False, separate: bool = False
 ) -> Any:
     try:
         return OpenEXR.File(source, separate_channels=separate, header_only=header_only)
@@ -428,16 +435,18 @@ def _window(path: Path, raw: Mapping[str, Any], name: str) -> tuple[Corner, Corn
     return (first[0], first[1]), (last[0], last[1])
 
 
-def _decode_exr(path: Path, content: Content) -> Image:
+def _decode_exr(path: Path, stream: Stream | HeldStream) -> Image:
     # The header first: a picture that is refused must not be decoded, and a damaged part of a
     # multi-part file vanishes without a word when the pixels are read.
-    listed = _open_exr(path, io.BytesIO(content.data), header_only=True)
+    listed = _open_exr(path, stream, header_only=True)
     header = _exr_header(path, listed)
+    stream.seek(0)
     try:
-        file = _open_exr(path, io.BytesIO(content.data))
+        file = _open_exr(path, stream)
     except DamagedFileError:
         # OpenEXR joins R, G, B to one array only where they are of one type.
-        file = _open_exr(path, io.BytesIO(content.data), separate=True)
+        stream.seek(0)
+        file = _open_exr(path, stream, separate=True)
     if len(file.parts) != len(listed.parts):
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
     if len(file.parts) > 1:
@@ -456,7 +465,7 @@ def _decode_exr(path: Path, content: Content) -> Image:
         names = [name for name in "RGBA" if name in layers]
         colour = np.stack([layers.pop(name).astype(np.float32) for name in names], axis=-1)
         layers["".join(names)] = colour
-    return Image(path, header, layers, content.fingerprint)
+    return Image(path, header, layers, stream.fingerprint())
 
 
 def _placed(values: NDArray[Any], first: tuple[int, int], header: Header) -> NDArray[Any]:

@@ -1,6 +1,7 @@
 """Files appear whole or not at all."""
 
 import errno
+import io
 import os
 import socket
 import stat
@@ -18,6 +19,7 @@ from shadowtool.io.files import (
     fingerprint,
     fingerprint_file,
     make_folder,
+    open_stream,
     read_bytes,
     read_content,
     reading_once,
@@ -278,6 +280,57 @@ def test_a_files_fingerprint_is_its_contents(tmp_path):
     os.utime(tmp_path / "b", (0, 0))
     assert fingerprint_file(tmp_path / "a") == fingerprint_file(tmp_path / "b")
     assert fingerprint_file(tmp_path / "a") == fingerprint(b"content")
+
+
+BLOCK = 262_336
+
+
+@pytest.mark.parametrize("size", [0, 1, 5_000, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK, 700_001])
+def test_a_stream_reads_what_a_file_holds_wherever_it_is_asked(size, tmp_path):
+    rng = np.random.default_rng(size)
+    content = rng.integers(0, 256, size, np.uint8).tobytes()
+    (tmp_path / "a").write_bytes(content)
+    with open_stream(tmp_path / "a") as stream:
+        assert stream.seek(0, os.SEEK_END) == size
+        place = stream.seek(0)
+        for number in range(60):
+            if number % 7 == 0:
+                place = stream.seek(int(rng.integers(0, size + 1)))
+            wanted = int(rng.choice([0, 1, 8, 5_000, 120_000, 400_000]))
+            assert stream.read(wanted) == content[place : place + wanted]
+            place = min(place + wanted, size)
+            assert stream.tell() == place
+        assert stream.fingerprint() == fingerprint(content)
+    with open_stream(tmp_path / "a") as unread:
+        assert unread.fingerprint() == fingerprint(content)
+
+
+def test_what_is_held_is_streamed_from_memory(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"first")
+    with reading_once([path]):
+        path.write_bytes(b"second")
+        with open_stream(path) as stream:
+            assert (stream.read(9), stream.fingerprint()) == (b"first", fingerprint(b"first"))
+
+
+def test_a_fault_of_the_machine_in_the_middle_of_a_stream_is_worth_a_retry(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    path.write_bytes(bytes(10))
+
+    class Failing(io.FileIO):
+        def readinto(self, buffer):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr("io.FileIO", Failing)
+    with pytest.raises(RetryError, match="a: cannot read"):
+        fingerprint_file(path)
+    # OpenEXR passes the error on as another.
+    with pytest.raises(RetryError, match="a: cannot read"), open_stream(path) as stream:
+        try:
+            stream.read(5)
+        except OSError:
+            raise ValueError("something") from None
 
 
 def test_the_fingerprint_of_a_missing_file_is_an_error(tmp_path):

@@ -1,6 +1,8 @@
 """EXR and PNG: what is written comes back, and what is damaged is refused by name."""
 
+import errno
 import io
+import os
 import resource
 import struct
 import subprocess
@@ -17,7 +19,7 @@ import OpenEXR
 import pytest
 
 from shadowtool.core.transfer import TRANSFERS
-from shadowtool.errors import DamagedFileError, InputError
+from shadowtool.errors import DamagedFileError, InputError, RetryError
 from shadowtool.io.files import fingerprint
 from shadowtool.io.image import (
     Header,
@@ -349,6 +351,26 @@ def test_what_is_no_exr_is_damaged(content, read, tmp_path):
     path.write_bytes(content)
     with pytest.raises(DamagedFileError, match=r"frame\.exr: "):
         read(path)
+
+
+@pytest.mark.parametrize("after", [0, 1])
+def test_a_machine_that_fails_while_a_picture_is_decoded_is_worth_a_retry(
+    after, tmp_path, monkeypatch
+):
+    write_exr(tmp_path / "large.exr", {"RGB": random(300, 400, 3)})
+
+    class Failing(io.FileIO):
+        blocks = 0
+
+        def readinto(self, buffer):
+            self.blocks += 1
+            if self.blocks > after:
+                raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+            return super().readinto(buffer)
+
+    monkeypatch.setattr("io.FileIO", Failing)
+    with pytest.raises(RetryError, match="large.exr: cannot read: Stale"):
+        read_image(tmp_path / "large.exr")
 
 
 def test_a_png_named_exr_is_damaged(png, tmp_path):

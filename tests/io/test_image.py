@@ -369,7 +369,7 @@ def test_a_machine_that_fails_while_a_picture_is_decoded_is_worth_a_retry(
             return super().readinto(buffer)
 
     monkeypatch.setattr("io.FileIO", Failing)
-    with pytest.raises(RetryError, match="large.exr: cannot read: Stale"):
+    with pytest.raises(RetryError, match=r"large\.exr: cannot read: Stale"):
         read_image(tmp_path / "large.exr")
 
 

@@ -4,6 +4,8 @@ The bits of a half are a piecewise linear logarithm of it: a step of one is a ch
 thousandth, and 16-bit integers are compared and added many times faster than halfs.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -25,17 +27,30 @@ def to_keys(halfs: NDArray[np.float16]) -> Int16:
     return _folded(np.ascontiguousarray(halfs).view(np.int16))
 
 
-def finite_keys(halfs: NDArray[np.float16]) -> tuple[Int16, NDArray[np.bool_] | None]:
-    """`to_keys` of (H, W, 3), and where a channel is NaN or infinite, (H, W); None for nowhere."""
+class FiniteKeys(NamedTuple):
+    """Keys, and what there is to know of them.
+
+    Attributes:
+        keys: (H, W, 3) int16, as of `to_keys`.
+        signed: whether one may be negative.
+        bad: (H, W), where a channel is NaN or infinite; None for nowhere.
+    """
+
+    keys: Int16
+    signed: bool
+    bad: NDArray[np.bool_] | None
+
+
+def finite_keys(halfs: NDArray[np.float16]) -> FiniteKeys:
+    """`to_keys` of (H, W, 3), in one look where they are neither negative nor infinite."""
     bits = np.ascontiguousarray(halfs).view(np.uint16)
     if bits.max(initial=0) < _INFINITE:
-        # Neither a sign among them nor more than the largest half.
-        return bits.view(np.int16), None
+        return FiniteKeys(bits.view(np.int16), False, None)
     keys = _folded(bits.view(np.int16))
     if keys.max() < _INFINITE and keys.min() >= -_INFINITE:
-        return keys, None
+        return FiniteKeys(keys, True, None)
     bad = (keys >= _INFINITE) | (keys < -_INFINITE)
-    return keys, np.asarray(bad.any(axis=-1), bool)
+    return FiniteKeys(keys, True, np.asarray(bad.any(axis=-1), bool))
 
 
 def from_keys(keys: Int16) -> NDArray[np.float16]:
@@ -86,9 +101,13 @@ def keys_per_unit(values: NDArray[np.floating]) -> Float32:
     return np.asarray(steps, np.float32)
 
 
-def gray_keys(keys: Int16) -> Int16:
-    """One key a pixel, (H, W), of the keys of its three channels (H, W, 3): their luma."""
-    if not keys.size or keys.min() >= 0:
+def gray_keys(keys: Int16, signed: bool = True) -> Int16:
+    """One key a pixel, (H, W), of the keys of its three channels (H, W, 3): their luma.
+
+    Args:
+        signed: whether one may be negative.
+    """
+    if not signed:
         return np.asarray(cv2.cvtColor(keys.view(np.uint16), cv2.COLOR_RGB2GRAY)).view(np.int16)
     # OpenCV knows unsigned integers only; the weights add up to 1, so an offset stays the same.
     above = (keys ^ _SIGN).view(np.uint16)

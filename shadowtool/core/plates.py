@@ -122,7 +122,8 @@ def _order_keys(
     """Values that compare as the image's do, int16 for halfs and float32 else, and where a channel
     is not finite, None for nowhere."""
     if image.dtype == np.float16:
-        return finite_keys(image.astype(np.float16, copy=False))
+        keys, _, bad = finite_keys(image.astype(np.float16, copy=False))
+        return keys, bad
     wrong = ~np.isfinite(image)
     return np.asarray(image, np.float32), np.asarray(wrong.any(axis=-1)) if wrong.any() else None
 

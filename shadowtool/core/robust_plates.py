@@ -56,10 +56,12 @@ class Keyed(NamedTuple):
     Attributes:
         keys: (H, W, 3) int16, the channels.
         gray: (H, W) int16, one key a pixel; those that are not seen are marked by `hide`.
+        signed: whether a key may be negative.
     """
 
     keys: Int16
     gray: Int16
+    signed: bool
 
 
 def keyed(image: NDArray[np.floating], holdout: NDArray[np.number] | None = None) -> Keyed:
@@ -71,21 +73,21 @@ def keyed(image: NDArray[np.floating], holdout: NDArray[np.number] | None = None
     halfs = np.ascontiguousarray(halfs, np.float16)
     keys = halfs.view(np.int16)
     gray = np.empty(keys.shape[:2], np.int16)
-    copied = False
+    signed = False
     for start in range(0, len(keys), _ROWS):
         rows = slice(start, start + _ROWS)
-        own, bad = finite_keys(halfs[rows])
-        if own.min() < 0:
+        own = finite_keys(halfs[rows])
+        if own.signed:
             # Halfs are their own keys where none is negative.
-            keys = keys if copied else keys.copy()
-            keys[rows], copied = own, True
-        gray[rows] = gray_keys(own)
-        if bad is not None:
-            hide(gray[rows], bad)
+            keys = keys if signed else keys.copy()
+            keys[rows], signed = own.keys, True
+        gray[rows] = gray_keys(own.keys, own.signed)
+        if own.bad is not None:
+            hide(gray[rows], own.bad)
     if holdout is not None:
         # NaN in a matte says nothing in favour of the pixel.
         hide(gray, np.asarray(~(holdout <= 0)))
-    return Keyed(keys, gray)
+    return Keyed(keys, gray, signed)
 
 
 def hide(gray: Int16, where: Bool) -> None:
@@ -186,7 +188,7 @@ class _Group:
         distance *= joining
         distance /= np.maximum(frames, 1)
         gray += distance
-        _accumulate(frame.keys[window], self.total[window], joining.view(np.uint8))
+        _accumulate(frame, window, self.total, joining.view(np.uint8))
         return dark & ~joining
 
     def add(self, where: Index, single: _Members, width: Float32) -> tuple[Index, Index, _Members]:
@@ -234,7 +236,7 @@ class RobustPlates:
             rows = slice(start, start + _ROWS)
             gray = frame.gray[rows]
             lit = np.asarray(cv2.inRange(gray, self._lit_low[rows], self._lit_high[rows]), np.uint8)
-            _accumulate(frame.keys[rows], self._total[rows], lit)
+            _accumulate(frame, (rows, slice(None)), self._total, lit)
             # As signed bytes the mask's 255 are -1.
             self._count[rows] -= lit.view(np.int8)
             self._darken(frame, rows)
@@ -293,16 +295,17 @@ def _below(gray: Int16) -> Float32:
     return np.asarray(gray - np.float32(_UNSEEN), np.float32)
 
 
-def _accumulate(keys: Int16, total: Float32, mask: NDArray[np.uint8]) -> None:
-    """Add keys (H, W, 3) to sums where a mask is not 0.
+def _accumulate(frame: Keyed, window: Window, total: Float32, mask: NDArray[np.uint8]) -> None:
+    """Add a window of a frame's keys to sums (H, W, 3) where the window's mask is not 0.
 
     Single floats hold the sums of 500 frames exactly, and are added to several times faster than
     integers of their size; of thousands they are off by a hundredth of a key.
     """
-    if keys.min() >= 0:
-        cv2.accumulate(keys.view(np.uint16), total, mask)
+    keys, sums = frame.keys[window], total[window]
+    if frame.signed:
+        cv2.add(sums, keys, dst=sums, mask=mask, dtype=cv2.CV_32F)
     else:
-        cv2.add(total, keys, dst=total, mask=mask, dtype=cv2.CV_32F)
+        cv2.accumulate(keys.view(np.uint16), sums, mask)
 
 
 def _thresholds(noise: NoiseModel) -> tuple[Int16, Int16, Int16, Float32]:

@@ -100,8 +100,8 @@ CONTRACTS = {
         half_keys.finite_keys,
         lambda h, w: st.tuples(halfs(h, w)),
         lambda r, a: (
-            np.array_equal(half_keys.from_keys(r[0]).view("i2"), a.view("i2"))
-            and np.array_equal(unknown(a), np.zeros(a.shape[:2], bool) if r[1] is None else r[1])
+            np.array_equal(half_keys.from_keys(r.keys).view("i2"), a.view("i2"))
+            and np.array_equal(unknown(a), np.zeros(a.shape[:2], bool) if r.bad is None else r.bad)
         ),
     ),
     "extremes of halfs": Contract(

@@ -156,16 +156,18 @@ def test_gray_keys_climb_with_every_channel(one: np.ndarray, other: np.ndarray) 
 def test_what_is_not_finite_is_so_in_any_channel(values: np.ndarray) -> None:
     rng = np.random.default_rng(0)
     halfs = rng.choice(values, (60, 70, 3))
-    keys, bad = finite_keys(halfs)
+    keys, signed, bad = finite_keys(halfs)
     assert np.array_equal(keys, to_keys(halfs)) and bad is None
+    assert signed == (keys.min() < 0)
+    assert np.array_equal(gray_keys(keys, signed), gray_keys(keys))
     for wrong in (np.nan, -np.nan, np.inf, -np.inf):
         halfs[rng.random(halfs.shape) < 0.03] = wrong
         for part in (halfs, halfs[:, ::2], halfs[::-1]):
-            keys, bad = finite_keys(part)
+            keys, signed, bad = finite_keys(part)
+            assert signed
             assert np.array_equal(keys, to_keys(part))
             assert np.array_equal(bad, ~np.isfinite(part).all(axis=-1))
 
 
 def test_the_keys_of_nothing_are_nothing() -> None:
-    keys, bad = finite_keys(np.zeros((0, 5, 3), np.float16))
-    assert keys.shape == (0, 5, 3) and bad is None
+    assert finite_keys(np.zeros((0, 5, 3), np.float16))[0].shape == (0, 5, 3)

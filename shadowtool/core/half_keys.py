@@ -101,14 +101,17 @@ def keys_per_unit(values: NDArray[np.floating]) -> Float32:
     return np.asarray(steps, np.float32)
 
 
-def gray_keys(keys: Int16, signed: bool = True) -> Int16:
+def gray_keys(keys: Int16, signed: bool = True, out: Int16 | None = None) -> Int16:
     """One key a pixel, (H, W), of the keys of its three channels (H, W, 3): their luma.
 
     Args:
         signed: whether one may be negative.
+        out: (H, W) to write to; an array of its own if there is none.
     """
-    if not signed:
-        return np.asarray(cv2.cvtColor(keys.view(np.uint16), cv2.COLOR_RGB2GRAY)).view(np.int16)
     # OpenCV knows unsigned integers only; the weights add up to 1, so an offset stays the same.
-    above = (keys ^ _SIGN).view(np.uint16)
-    return np.asarray(cv2.cvtColor(above, cv2.COLOR_RGB2GRAY)).view(np.int16) ^ _SIGN
+    above = (keys ^ _SIGN if signed else keys).view(np.uint16)
+    gray = np.empty(keys.shape[:2], np.int16) if out is None else out
+    cv2.cvtColor(above, cv2.COLOR_RGB2GRAY, dst=gray.view(np.uint16))
+    if signed:
+        gray ^= _SIGN
+    return gray

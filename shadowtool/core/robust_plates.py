@@ -81,7 +81,7 @@ def keyed(image: NDArray[np.floating], holdout: NDArray[np.number] | None = None
             # Halfs are their own keys where none is negative.
             keys = keys if signed else keys.copy()
             keys[rows], signed = own.keys, True
-        gray[rows] = gray_keys(own.keys, own.signed)
+        gray_keys(own.keys, own.signed, gray[rows])
         if own.bad is not None:
             hide(gray[rows], own.bad)
     if holdout is not None:
@@ -226,6 +226,8 @@ class RobustPlates:
         )
         self._near = np.asarray(near, np.float32)
         height, width = levels.shape
+        # OpenCV's new arrays cost more than what is worked out in them.
+        self._mask = np.empty((_ROWS, width), np.uint8)
         self._total = np.zeros((height, width, 3), np.float32)
         self._count = np.zeros((height, width), np.int32)
         self._lowest, self._next = _Group(height, width), _Group(height, width)
@@ -235,7 +237,8 @@ class RobustPlates:
         for start in range(0, len(frame.gray), _ROWS):
             rows = slice(start, start + _ROWS)
             gray = frame.gray[rows]
-            lit = np.asarray(cv2.inRange(gray, self._lit_low[rows], self._lit_high[rows]), np.uint8)
+            lit = self._mask[: len(gray)]
+            cv2.inRange(gray, self._lit_low[rows], self._lit_high[rows], dst=lit)
             _accumulate(frame, (rows, slice(None)), self._total, lit)
             # As signed bytes the mask's 255 are -1.
             self._count[rows] -= lit.view(np.int8)

@@ -256,6 +256,7 @@ class RobustPlates:
             # Most join, and are quickest added where they stand.
             part[:] = self._lowest.join(window, frame, part, self._near)
         where = rows.start * dark.shape[1] + np.flatnonzero(dark)
+        where = where[~self._settled(frame, where)]
         if not where.size:
             return
         single = _Members(
@@ -267,6 +268,13 @@ class RobustPlates:
         above, below, replaced = self._lowest.add(where, single, width)
         self._next.put(where.take(below), replaced)
         self._next.add(where.take(above), single.take(above), width.take(above))
+
+    def _settled(self, frame: Keyed, where: Index) -> Bool:
+        """Which pixels of a frame lie above a group that no brighter one can replace any more."""
+        distance = _below(frame.gray.ravel().take(where)) - self._lowest.gray.ravel().take(where)
+        above = distance > self._near.ravel().take(where)
+        above &= self._lowest.frames.ravel().take(where) >= _LEAST_GROUP
+        return above
 
     def measured(self) -> Measured:
         """The plates so far."""

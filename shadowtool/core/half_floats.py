@@ -43,8 +43,8 @@ def rounded(values: NDArray[np.floating]) -> Float16:
 def shortened(values: Float32) -> Float32:
     """Single floats of any shape with 14 bits of their mantissa, rounded; NaN stays.
 
-    A sixteenth of what a half can tell apart. The rest of a mean of noisy frames is noise, and takes
-    long to compress.
+    A sixteenth of what a half can tell apart. The rest of a mean of noisy frames is noise, and
+    takes long to compress.
     """
     bits = values.view(np.uint32) + _HALF_UNIT
     bits &= ~(2 * _HALF_UNIT - 1)

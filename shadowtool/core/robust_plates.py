@@ -106,7 +106,9 @@ class LitLevels:
         """Take in the gray keys of one of the sample's frames, (H, W)."""
         for start in range(0, len(gray), _ROWS):
             rows = slice(start, start + _ROWS)
-            own = np.where(gray[rows] == _UNSEEN, _LOWEST_KEY, gray[rows])
+            own = gray[rows]
+            if own.max() == _UNSEEN:
+                own = np.where(own == _UNSEEN, _LOWEST_KEY, own)
             for highest in self._highest:
                 held = highest[rows]
                 lower = np.minimum(held, own)

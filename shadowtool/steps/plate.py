@@ -207,6 +207,14 @@ class _Shown(NamedTuple):
     gain: float
 
 
+class _Kept(NamedTuple):
+    """A frame as it was read, and its grid."""
+
+    values: NDArray[np.floating]
+    grid: NDArray[np.float32]
+    mark: str
+
+
 @dataclass
 class _Take:
     """The frames with their holdouts, read in parallel and handed on in order.
@@ -217,6 +225,8 @@ class _Take:
         level: whether changes of exposure are taken out.
         reference: what exposure is measured against, on its grid; None until it is known.
         kept: frames that have been read already, and their fingerprints.
+        kept: sampled frames that need not be read again.
+        known_gains: of the sampled frames.
         gains: of the frames that were used, where they are not 1.
         folder: where the automatic one is written.
     """
@@ -229,7 +239,8 @@ class _Take:
     provenance: dict[str, str]
     background: Background | None = None
     reference: NDArray[np.float32] | None = None
-    kept: dict[Frame, tuple[NDArray[np.floating], str]] = field(default_factory=dict)
+    kept: dict[Frame, _Kept] = field(default_factory=dict)
+    known_gains: dict[Frame, float] = field(default_factory=dict)
     gains: dict[str, float] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
@@ -249,11 +260,12 @@ class _Take:
         """What the automatic holdout looks at of a frame."""
         return on_grid(values, self.step)
 
-    def gain(self, grid: NDArray[np.float32]) -> float:
+    def gain(self, frame: Frame, grid: NDArray[np.float32]) -> float:
         """A frame's exposure, from its grid."""
         if self.reference is None:
             return 1.0
-        return frame_gain(self.sparse(grid), self.reference)
+        known = self.known_gains.get(frame)
+        return frame_gain(self.sparse(grid), self.reference) if known is None else known
 
     def sparse(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
         """Exposure takes fewer pixels than a figure's outline, unless there are few."""
@@ -269,13 +281,13 @@ class _Take:
         def read(frame: Frame) -> _Shown | None:
             try:
                 if frame in self.kept:
-                    values, mark = self.kept.pop(frame) if last else self.kept[frame]
+                    values, grid, mark = self.kept.pop(frame) if last else self.kept[frame]
                 else:
                     image = self.footage.image(frame)
                     values, mark = image.rgb(self.footage.transfer), image.fingerprint
-                needed = not last or self.reference is not None or self.background is not None
-                grid = self.grid(values) if needed else _NO_GRID
-                gain = self.gain(grid)
+                    needed = not last or self.reference is not None or self.background is not None
+                    grid = self.grid(values) if needed else _NO_GRID
+                gain = self.gain(frame, grid)
                 if gain != 1:
                     values = without_gain(values, gain)
                     grid = self.grid(values)
@@ -366,14 +378,15 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         grids[frame] = item.grid
         if item.values.nbytes <= free:
             free -= item.values.nbytes
-            take.kept[frame] = item.values, item.marks[0]
+            take.kept[frame] = _Kept(item.values, item.grid, item.marks[0])
         elif with_levels:
             grays[frame] = keyed(item.values, item.holdout).gray
     noise = noise_model(noise_levels(thinned))
     apart = [frame for frame in grids if frame in spread]
     if take.level and apart:
         take.reference = common_reference([take.sparse(grids[frame]) for frame in apart])
-    gains = {frame: take.gain(grid) for frame, grid in grids.items()}
+    gains = {frame: take.gain(frame, grid) for frame, grid in grids.items()}
+    take.known_gains = gains
     if automatic and apart:
         level = [grids[frame] / np.float32(gains[frame]) for frame in apart]
         take.background = find_background(level, noise)

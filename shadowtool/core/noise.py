@@ -162,7 +162,7 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
         for level in range(_LEVELS)
     ]
     times = _heaviness(compared, share, noise_model(levels))
-    return [replace(level, sigma=level.sigma * times[level.channel]) for level in levels]
+    return [replace(level, sigma=level.sigma * float(times[level.channel])) for level in levels]
 
 
 def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:

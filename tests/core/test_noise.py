@@ -88,8 +88,10 @@ def test_noise_that_a_codec_makes_rare_and_large_is_as_large_as_it_is_far_off() 
 def test_normal_noise_is_not_taken_for_rare_and_large(moving: bool) -> None:
     shots = take(24, moving=moving)
     samples = {n: thin(shots[p]) for n, p in sample_positions(24).items()}
-    sigmas = np.array([level.sigma for level in noise_levels(samples)])
-    values = np.array([level.value for level in noise_levels(samples)])
+    levels = noise_levels(samples)
+    assert {type(level.sigma) for level in levels} == {float}
+    sigmas = np.array([level.sigma for level in levels])
+    values = np.array([level.value for level in levels])
     wanted = np.sqrt(SLOPE * values + FLOOR)
     assert np.median(sigmas / wanted) == pytest.approx(1, abs=0.12)
 

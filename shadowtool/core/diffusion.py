@@ -6,6 +6,7 @@ Perona and Malik 1990, with the flow from pixels that can be trusted to pixels t
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.warp_map import WarpMap, identity_map
 
@@ -40,6 +41,20 @@ def diffuse(
         np.where(unknown[..., np.newaxis], np.float32(0), warp_map.warp - identity),
         np.where(unknown, np.float32(0), warp_map.confidence),
     )
+    smooth = np.empty_like(displacement)
+    for rows, inner in overlapping_bands(height, iterations):
+        smooth[rows][inner] = _diffused(displacement[rows], trust[rows], iterations, edge, rate)[
+            inner
+        ]
+    smooth += identity
+    return WarpMap(smooth, np.where(unknown, np.float32(np.inf), warp_map.error))
+
+
+def _diffused(
+    displacement: Float32, trust: Float32, iterations: int, edge: float, rate: float
+) -> Float32:
+    """Rows of the displacement, right but for as many at the ends as there are iterations."""
+    displacement = displacement.copy()
     for _ in range(iterations):
         change = np.zeros_like(displacement)
         for axis in (0, 1):
@@ -56,4 +71,4 @@ def diffuse(
                 change[:, :-1] += flow_to_one
                 change[:, 1:] -= flow_to_other
         displacement += np.float32(rate) * change
-    return WarpMap(identity + displacement, np.where(unknown, np.float32(np.inf), warp_map.error))
+    return displacement

@@ -12,8 +12,12 @@ Float32 = NDArray[np.float32]
 _WIDEST = 0.35
 # A gain nearer to 1 than this is 1: the picture stays as it is, bit for bit.
 _NOTHING = 0.004
-# At least this part of the pixels must agree.
-_LEAST_PART = 0.05
+# What moves no time by which a shadow passes.
+_HARMLESS = 0.01
+# Into about so many areas a picture's longer side is divided.
+_AREAS = 160
+# At least this part of the pixels must agree, and so many.
+_LEAST_PART, _LEAST_PIXELS = 0.05, 16
 # Ratios this near to each other agree; the middle of them is closed in on, as penumbrae lie on
 # one side of it.
 _NEAR = (0.03, 0.02, 0.012, 0.008, 0.008)
@@ -31,27 +35,93 @@ def frame_gain(image: Float32, reference: Float32) -> float:
     Returns:
         The most frequent ratio of the two; 1 if it is next to 1, or nothing agrees.
     """
-    now, then = _sum(image), _sum(reference)
+    centre = _agreed(_ratios(_sum(image), _sum(reference)))
+    return 1.0 if centre is None or abs(centre) < _NOTHING else float(np.exp(centre))
+
+
+def _ratios(now: Float32, then: Float32) -> Float32:
+    """Logarithms of the ratios of two frames' brightness where it can be told."""
     usable = np.isfinite(now) & np.isfinite(then) & (then > 1e-2) & (now > 0)
-    ratio = np.log(now[usable] / then[usable])
-    near = np.sort(ratio[np.abs(ratio) < _WIDEST])
-    if near.size < max(_LEAST_PART * usable.sum(), 16):
-        return 1.0
+    return np.asarray(np.log(now[usable] / then[usable]), np.float32)
+
+
+def _agreed(ratios: Float32) -> float | None:
+    """The most frequent of them; None if none is."""
+    near = ratios[np.abs(ratios) < _WIDEST]
+    if near.size < max(_LEAST_PART * ratios.size, _LEAST_PIXELS):
+        return None
     counts, edges = np.histogram(near, bins=140, range=(-_WIDEST, _WIDEST))
     smooth = np.convolve(counts, np.hanning(9), mode="same")
     peak = int(np.argmax(smooth))
     centre = (edges[peak] + edges[peak + 1]) / 2
     agreed = near[np.abs(near - centre) < _NEAR[0]]
+    # What agrees is many, and many more than if the ratios were anything at all.
+    enough = max(_LEAST_PART * ratios.size, 2 * near.size * _NEAR[0] / _WIDEST)
+    return None if agreed.size < enough else _closed_in(near, centre)
+
+
+def _closed_in(ratios: Float32, centre: float, spread: float = 0.0) -> float:
+    """The middle of those near the centre; no nearer than they scatter."""
+    ascending = np.sort(ratios)
     for width in _NEAR:
-        members = near[np.abs(near - centre) < width]
+        members = ascending[np.abs(ascending - centre) < max(width, spread)]
         # Their median, as they are in order.
         middle = members[(members.size - 1) // 2 : members.size // 2 + 1]
         centre = float(middle.mean()) if middle.size else centre
-    # What agrees is many, and many more than if the ratios were anything at all.
-    enough = max(_LEAST_PART * usable.sum(), 2 * near.size * _NEAR[0] / _WIDEST)
-    if agreed.size < enough or abs(centre) < _NOTHING:
-        return 1.0
-    return float(np.exp(centre))
+    return centre
+
+
+def sampled_areas(gray: Float32) -> Float32:
+    """Means of runs of pixels in evenly spaced rows, (H, W) to (h, w); what is left over at the
+    right is left out."""
+    step = max(1, round(max(gray.shape) / _AREAS))
+    width = gray.shape[1] // step
+    if width == 0:
+        return gray[::step, :1].copy()
+    runs = gray[::step, : width * step].reshape(-1, width, step)
+    return np.asarray(np.einsum("ijk->ij", runs) / np.float32(step), np.float32)
+
+
+class RunningGain:
+    """Each frame's exposure against the first, of frames that come one after the other.
+
+    A shadow that is swept across the picture changes little of it from one frame to the next. So
+    what most pixels did since the last frame is exposure, however much is in shadow; and those
+    that are about as bright as that says, against the first frame, are in the same light as then:
+    they tell it without what many small errors add up to.
+    """
+
+    def __init__(self) -> None:
+        self._first: Float32 | None = None
+        self._last: Float32 | None = None
+        self._logarithm = 0.0
+
+    def add(self, gray: Float32) -> float:
+        """By how much this frame is brighter than the first; 1 if that does no harm.
+
+        Args:
+            gray: brightness of a few thousand pixels or small areas, the same in every frame,
+                linear light; not finite unknown.
+        """
+        if self._first is None or self._last is None:
+            self._first = self._last = gray
+            return 1.0
+        changes = _ratios(gray, self._last)
+        if changes.size < _LEAST_PIXELS:
+            return self._gain()
+        middle = float(np.median(changes))
+        spread = 1.48 * float(np.median(np.abs(changes - middle)))
+        expected = self._logarithm + _closed_in(changes, middle, spread)
+        ratios = _ratios(gray, self._first)
+        same = np.abs(ratios - expected) < max(_NEAR[0], spread)
+        if same.sum() >= max(_LEAST_PART * ratios.size, _LEAST_PIXELS):
+            expected = _closed_in(ratios, expected, spread)
+        self._logarithm, self._last = expected, gray
+        return self._gain()
+
+    def _gain(self) -> float:
+        steady = abs(self._logarithm) < _HARMLESS
+        return 1.0 if steady else float(np.exp(self._logarithm))
 
 
 def _sum(image: Float32) -> Float32:

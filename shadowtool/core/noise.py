@@ -6,7 +6,7 @@ a robust spread ignores.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -23,6 +23,9 @@ _NEAR, _FAR = (0.5, 0.6744898), (0.3, 0.3853205)
 _FROZEN = 0.2
 # Noise is as large as a code value, give or take this logarithm.
 _ONE_CODE = 0.7
+# Each quantile of |x| that rare noise is judged by, for a standard normal x; in how many tiles
+# along each side; and how much too large it has to be.
+_RARE, _TILES, _HEAVY = (0.9, 1.6448536), 8, 1.2
 _LEVELS = 12
 _GRID = 10_000
 _SAMPLES = 8
@@ -82,9 +85,9 @@ def sample_positions(frames: int) -> dict[int, int]:
 
 
 def thin(image: NDArray[np.floating]) -> Float32:
-    """The fixed grid of about 10,000 pixels, (P, 3), of a frame (H, W, 3) that is looked at."""
+    """The fixed grid of about 10,000 pixels, (h, w, 3), of a frame (H, W, 3) that is looked at."""
     step = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / _GRID)))
-    return image[::step, ::step].reshape(-1, 3).astype(np.float32)
+    return image[::step, ::step].astype(np.float32)
 
 
 class NoiseSamples:
@@ -118,33 +121,48 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
     """The noise against brightness.
 
     From neighbouring frames. A codec may repeat a pixel's noise until it sends the pixel anew;
-    then frames far apart are compared.
+    then frames far apart are compared. And what a codec leaves of noise is often next to nothing
+    and sometimes far off: then σ is that of normal noise that is as often as far off.
 
     Args:
-        samples: thinned frames under the running numbers of `sample_positions`; any may be absent.
+        samples: thinned frames (h, w, 3) under the running numbers of `sample_positions`; any may
+            be absent.
 
     Returns:
         Dark to bright, each channel in turn; empty where no two frames can be compared.
     """
-    near = [(a, a + 1) for a in samples if a % 2 == 0 and a + 1 in samples]
     firsts = sorted(a for a in samples if a % 2 == 0)
-    far = [(a, b) for a, b in combinations(firsts, 2) if b - a >= len(firsts) // 2]
-    measured = _spreads([(samples[a], samples[b]) for a, b in near], _NEAR)
+    near, far = (
+        [(samples[a], samples[b]) for a, b in pairs]
+        for pairs in (
+            [(a, a + 1) for a in firsts if a + 1 in samples],
+            [(a, b) for a, b in combinations(firsts, 2) if b - a >= len(firsts) // 2],
+        )
+    )
+    measured = _spreads(near, _NEAR)
     if not measured:
         return []
     values, sigmas, frozen, steps = np.median(measured, axis=0)
     # Where noise spans about one code value, rounding makes many differences nothing.
     codes = np.abs(np.log(np.maximum(steps, 1e-12) / np.maximum(sigmas, 1e-12)))
     repeated = np.median(frozen) > _FROZEN and (codes > _ONE_CODE).any()
-    if repeated and (distant := _spreads([(samples[a], samples[b]) for a, b in far], _FAR)):
-        values, sigmas, _, steps = np.quantile(distant, _FAR_QUANTILE, axis=0)
+    compared, share = near, 0.5
+    if repeated and (distant := _spreads(far, _FAR)):
+        compared, share = far, _FAR_QUANTILE
+        values, sigmas, _, steps = np.quantile(distant, share, axis=0)
+    # A level of one code value says nothing of the next.
+    some = np.where(steps > 0, steps, np.nan)
+    step = np.array([np.nanmedian(own) if np.isfinite(own).any() else 0.0 for own in some.T])
+    steps = np.where(steps > 0, steps, step)
     # Noise that rounding to code values hides is as large as the rounding.
     sigmas = np.sqrt(sigmas**2 + steps**2 / 12)
-    return [
+    levels = [
         NoiseLevel(channel, float(values[level, channel]), float(sigmas[level, channel]))
         for channel in range(3)
         for level in range(_LEVELS)
     ]
+    times = _heaviness(compared, share, noise_model(levels))
+    return [replace(level, sigma=level.sigma * float(times[level.channel])) for level in levels]
 
 
 def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
@@ -176,7 +194,8 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
     """For each pair of thinned frames (4, levels, 3): brightness, standard deviation, the part of
     the differences that are next to nothing, and the step between code values."""
     spreads = []
-    for first, second in pairs:
+    for pair in pairs:
+        first, second = (image.reshape(-1, 3) for image in pair)
         usable = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
         if usable.sum() < 4 * _LEVELS:
             continue
@@ -207,6 +226,27 @@ def _ascending(values: Float32) -> NDArray[np.int64]:
     bits = (values + np.float32(0)).view(np.int32)
     keys = (bits ^ ((bits >> 31) & np.int32(0x7FFFFFFF))).astype(np.int64)
     return np.sort(keys << 32 | np.arange(len(keys))) & 0xFFFFFFFF
+
+
+def _heaviness(pairs: list[tuple[Float32, Float32]], share: float, noise: NoiseModel) -> Float64:
+    """How many times as far off as normal noise of this model rare noise is in most of the picture,
+    (3,): what moved is in some places, and noise in all. 1 where that is next to nothing. Of the
+    pairs this share is no better."""
+    found = []
+    for first, second in pairs:
+        sigma = noise.sigma((first + second) / 2) * np.float32(np.sqrt(2))
+        off = np.abs(first - second) / sigma
+        parts = (
+            tile.reshape(tile.shape[0] * tile.shape[1], 3)
+            for band in np.array_split(off, _TILES)
+            for tile in np.array_split(band, _TILES, axis=1)
+        )
+        tiles = [part[np.isfinite(part).all(axis=1)] for part in parts]
+        rare = [np.quantile(tile, _RARE[0], axis=0) for tile in tiles if len(tile) >= _LEVELS]
+        if rare:
+            found.append(np.median(rare, axis=0) / _RARE[1])
+    times = np.quantile(found, share, axis=0) if found else np.ones(3)
+    return np.where(times < _HEAVY, 1.0, times)
 
 
 def _code_steps(values: Float32) -> Float32:

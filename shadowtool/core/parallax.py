@@ -7,6 +7,7 @@ measures the one number s by itself, n·(p + s u) + d = 0, and passes that disag
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
 from shadowtool.core.shadow_lines import interpolate_lines
 from shadowtool.core.warp_map import Pass
 
@@ -38,6 +39,18 @@ def measure_parallax(
         s and its standard deviation, pixels, (H, W) float32 each; NaN and infinite where fewer than
         two passes reached the pixel, or none measures it.
     """
+    shape = positions.shape[:2]
+    shift, deviation = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    for rows in bands(shape):
+        own = [scan.part(rows) for scan in passes]
+        part = _measured(own, positions[rows], directions[rows], speeds)
+        shift[rows], deviation[rows] = part
+    return shift, deviation
+
+
+def _measured(
+    passes: list[Pass], positions: Float32, directions: Float32, speeds: list[Float64]
+) -> tuple[Float32, Float32]:
     measured = [
         _one(scan, positions, directions, speed) for scan, speed in zip(passes, speeds, strict=True)
     ]

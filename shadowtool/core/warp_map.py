@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
 from shadowtool.core.half_floats import to_float
 from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines
 from shadowtool.core.shadow_time import ShadowTimes
@@ -74,6 +75,15 @@ def intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
     Returns:
         W; unknown where fewer than two passes that differ by `LEAST_ANGLE` reached the pixel.
     """
+    shape = passes[0].times.time.shape
+    found = WarpMap(np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+    for rows in bands(shape):
+        part = _intersect([scan.part(rows) for scan in passes], speeds)
+        found.warp[rows], found.error[rows] = part.warp, part.error
+    return found
+
+
+def _intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
     shape = passes[0].times.time.shape
     # The normal equations Σ w nnᵀ q = -Σ w d n, and the same with each line in units of its own
     # standard deviation, whose inverse is q's covariance.

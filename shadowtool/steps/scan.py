@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.choices import Gain
 from shadowtool.core.bands import overlapping_bands
+from shadowtool.core.exposure import RunningGain, sampled_areas
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.pictures import time_picture
 from shadowtool.core.shadow_lines import (
@@ -67,6 +69,7 @@ def scan(
     *,
     plane: str,
     run: Run = Run(),
+    gain: Gain = "auto",
     transfer: str = "auto",
 ) -> Result:
     """Write ``scan.exr`` (times, their errors, contrast), ``lines.json`` and a picture of both.
@@ -74,6 +77,7 @@ def scan(
     Args:
         plane: the reference plane region: a mask image (above half is inside), or a polygon
             ``x,y x,y x,y …`` in pixels.
+        gain: follow the light's changes and take them out, or take frames as they are.
 
     Raises:
         InputError: frames or mask are missing or don't fit.
@@ -89,7 +93,7 @@ def scan(
     refuse_existing([*products, output / MANIFEST], run)
     recipe = Recipe(
         "scan",
-        {"transfer": footage.transfer},
+        {"gain": gain, "transfer": footage.transfer},
         {"frames": Path(footage.sequence.pattern).name, "--plane": plane_mark},
     )
     if run.resume:
@@ -98,7 +102,8 @@ def scan(
         figures = unchanged(output, products, mark)
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
-    crossings, noise, marks, used = _crossings(footage, frames, run)
+    crossings, noise, marks, gains = _crossings(footage, frames, gain, run)
+    used = list(gains)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
     numbers = np.array([float(frame) for frame in used])
     if numbers[-1] > 2**20:
@@ -116,7 +121,7 @@ def scan(
             " or mark a larger plane"
         ) from None
     bend = line_bend(points, numbers, lines, footage.header.size)
-    figures = _figures(times, lines, used, bend)
+    figures = _figures(times, lines, gains, bend)
     _advise(figures, footage.sequence.pattern)
     mark = recipe.fingerprint([plane_mark, *marks])
     provenance = recipe.provenance(mark)
@@ -129,12 +134,13 @@ def scan(
 
 
 def _crossings(
-    footage: Footage, frames: list[Frame], run: Run
-) -> tuple[Crossings, NoiseModel, list[str], list[Frame]]:
-    """One reading of the pass."""
+    footage: Footage, frames: list[Frame], gain: Gain, run: Run
+) -> tuple[Crossings, NoiseModel, list[str], dict[Frame, float]]:
+    """One reading of the pass: its crossings and noise, the content of its files, and the gains of
+    the frames that could be read."""
     samples = sample_positions(len(frames))
 
-    def read(position: int) -> tuple[Float32, Float32 | None, str] | None:
+    def read(position: int) -> tuple[Float32, Float32, Float32 | None, str] | None:
         try:
             image = footage.image(frames[position])
         except DamagedFileError:
@@ -143,24 +149,28 @@ def _crossings(
             raise
         values = image.rgb(footage.transfer)
         sample = thin(values) if position in samples.values() else None
-        return luminance(values), sample, image.fingerprint
+        gray = luminance(values)
+        return gray, sampled_areas(gray), sample, image.fingerprint
 
-    finder, marks, used = CrossingFinder(), list[str](), list[Frame]()
+    finder, exposure = CrossingFinder(), RunningGain()
+    marks, gains = list[str](), dict[Frame, float]()
     thinned: dict[int, Float32] = {}
     run.progress(0, len(frames))
     for position, item in enumerate(ordered_map(read, range(len(frames)), run.jobs)):
         if item is not None:
-            gray, sample, mark = item
-            finder.add(gray)
+            gray, areas, sample, mark = item
+            own = exposure.add(areas) if gain == "auto" else 1.0
+            finder.add(gray if own == 1 else gray / np.float32(own))
             marks.append(mark)
-            used.append(frames[position])
+            gains[frames[position]] = own
             if sample is not None:
+                sample = sample if own == 1 else sample / np.float32(own)
                 thinned |= {n: sample for n, where in samples.items() if where == position}
         run.progress(position + 1, len(frames))
-    if len(used) < 3:
+    if len(gains) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
     noise = noise_model(noise_levels(thinned))
-    return significant(finder.found(), noise), noise, marks, used
+    return significant(finder.found(), noise), noise, marks, gains
 
 
 def _times(
@@ -229,12 +239,15 @@ def _advise(figures: Figures, take: str) -> None:
         )
 
 
-def _figures(times: ShadowTimes, lines: ShadowLines, frames: list[Frame], bend: Bend) -> Figures:
+def _figures(
+    times: ShadowTimes, lines: ShadowLines, gains: dict[Frame, float], bend: Bend
+) -> Figures:
     speed = line_speed(lines, times.time.shape)
     turned = math.degrees(float(lines.angle[-1] - lines.angle[0]))
     origins = list(lines.origin)
     return {
-        "frames": len(frames),
+        "frames": len(gains),
+        "gain": {"least": round(min(gains.values()), 4), "most": round(max(gains.values()), 4)},
         "reached": round(float(np.isfinite(times.time).mean()), 4),
         "lines": {
             "first": float(lines.frame[0]),

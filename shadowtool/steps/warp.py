@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
 
-from shadowtool.core.bands import bands
+from shadowtool.core.bands import bands, in_all_channels
 from shadowtool.core.diffusion import diffuse
 from shadowtool.core.epipole import Epipole
 from shadowtool.core.half_floats import to_float, to_half
@@ -16,7 +17,6 @@ from shadowtool.core.warp_map import (
     LEAST_ANGLE,
     Pass,
     WarpMap,
-    identity_map,
     pass_angles,
     positions,
     sample,
@@ -37,7 +37,7 @@ from shadowtool.steps.run import (
     unchanged,
     write_manifest,
 )
-from shadowtool.steps.solve import Solved, solve
+from shadowtool.steps.solve import solve
 
 PICTURE = "warp.png"
 
@@ -125,22 +125,27 @@ class _Scans:
                 f" {math.degrees(widest):.1f} degrees apart; turn the stick by 45 or more"
             )
 
-    def solve(self, run: Run, output: Path) -> Solved:
-        """W as the passes measure it; refused if they hardly do."""
-        solved = solve(self.passes, run.jobs, run.progress)
-        known = np.isfinite(solved.warp_map.error)
+    def solve(self, run: Run, output: Path) -> tuple[WarpMap, Figures]:
+        """W as the passes measure it, and what a crew needs to know; refused if they hardly do.
+
+        The passes are gone afterwards: there may be a gigabyte of them.
+        """
+        measured, epipole = solve(self.passes, run.jobs, run.progress)
+        known = np.isfinite(measured.error)
         if known.mean() < _LEAST_KNOWN:
             raise ReshootError(
                 f"{output}: reshoot: two sweeps reached only {known.mean():.1%} of the frame"
                 f" ({', '.join(self.names)}); let every sweep cross all of it"
             )
-        error = float(np.median(solved.warp_map.error[known]))
+        error = float(np.median(measured.error[known]))
         if error > _WORST_ERROR:
             raise ReshootError(
                 f"{output}: reshoot: the map would be off by {error:.1f} pixels"
                 f" ({', '.join(self.names)}); sweep more slowly, with a straighter edge"
             )
-        return solved
+        figures = _figures(self.names, self.passes, measured, epipole)
+        self.passes.clear()
+        return measured, figures
 
 
 def _open_scans(folders: list[Path], beside: tuple[Header, str] | None = None) -> _Scans:
@@ -171,12 +176,11 @@ def _solve(
     for every in (target, source):
         if every is not None:
             every.require_angles()
-    measured, epipole = target.solve(run, output)
+    shown = _gray(target.passes)
+    measured, figures = target.solve(run, output)
     result = diffuse(measured, iterations)
-    figures = _figures(target, measured, epipole)
     if source is not None:
-        own, own_epipole = source.solve(run, output)
-        figures["source"] = _figures(source, own, own_epipole)
+        own, figures["source"] = source.solve(run, output)
         onward = invert(diffuse(own, iterations))
         measured = compose(result, onward)
         seen = float(np.isfinite(measured.error).mean())
@@ -191,7 +195,7 @@ def _solve(
     provenance = recipe.provenance(mark)
     make_folder(output)
     write_warp(output / WARP, result, target.header, provenance)
-    write_png(output / PICTURE, _picture(target.passes, result), provenance)
+    write_png(output / PICTURE, warp_picture(in_all_channels(shown), result), provenance)
     write_manifest(output, recipe, mark, figures)
     return Result("warp", output, [], 0, (), figures)
 
@@ -272,13 +276,13 @@ def _scaled(places: np.ndarray, header: Header, source: Header) -> np.ndarray:
     return ((places + 0.5) * factor - 0.5).astype(np.float32)
 
 
-def _figures(scans: _Scans, measured: WarpMap, epipole: Epipole | None) -> Figures:
-    names, passes = scans.names, scans.passes
+def _figures(
+    names: list[str], passes: list[Pass], measured: WarpMap, epipole: Epipole | None
+) -> Figures:
     known = np.isfinite(measured.error)
     error = measured.error[known]
-    displacement = np.linalg.norm(
-        measured.warp[known] - identity_map(*measured.error.shape)[known], axis=-1
-    )
+    y, x = np.nonzero(known)
+    displacement = np.hypot(measured.warp[known, 0] - x, measured.warp[known, 1] - y)
     return {
         "reached": {
             name: round(float(np.isfinite(scan.times.time).mean()), 4)
@@ -308,7 +312,7 @@ def _figures(scans: _Scans, measured: WarpMap, epipole: Epipole | None) -> Figur
     }
 
 
-def _picture(passes: list[Pass], solved: WarpMap) -> np.ndarray:
-    contrast = np.max([scan.times.contrast for scan in passes], axis=0)
-    gray = contrast / max(float(np.percentile(contrast, 99)), 1e-6) * 0.5
-    return warp_picture(np.repeat(gray[..., None], 3, axis=-1), solved)
+def _gray(passes: list[Pass]) -> np.ndarray:
+    """What the target looks like, as far as its contrasts tell, (H, W) float32."""
+    contrast = reduce(np.maximum, (scan.times.contrast for scan in passes))
+    return np.asarray(contrast / max(float(np.percentile(contrast, 99)), 1e-6) * 0.5, np.float32)

@@ -253,12 +253,12 @@ CONTRACTS = {
     "thin": Contract(
         noise.thin,
         lambda h, w: st.tuples(halfs(h, w)),
-        lambda r, a: r.dtype == np.float32 and r.ndim == 2 and r.shape[1] == 3,
+        lambda r, a: r.dtype == np.float32 and r.ndim == 3 and r.shape[2] == 3,
     ),
     "noise_model": Contract(
         lambda samples: noise.noise_model(noise.noise_levels(dict(enumerate(samples)))),
         lambda h, w: st.tuples(
-            st.lists(array(60, 3, dtype=np.float32), min_size=0, max_size=4)
+            st.lists(array(6, 10, 3, dtype=np.float32), min_size=0, max_size=4)
         ),
         lambda r, samples: (r.slope >= 0).all() and (r.floor > 0).all(),
     ),

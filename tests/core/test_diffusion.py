@@ -53,6 +53,18 @@ def test_what_is_well_known_is_not_moved_by_what_is_not() -> None:
     assert distance(smooth.warp)[10:80, 121].mean() < 0.7
 
 
+def test_rows_worked_on_at_a_time_leave_no_seam() -> None:
+    rng = np.random.default_rng(2)
+    warp = identity_map(300, 9) + rng.normal(size=(300, 9, 2)).astype(np.float32)
+    error = rng.uniform(0.1, 2, (300, 9)).astype(np.float32)
+    whole = diffuse(WarpMap(warp, error), iterations=6).warp
+    # Each of the two parts is small enough to be worked on at once, and far from its cut as before.
+    for kept, cut in ((slice(0, 90), slice(0, 100)), (slice(120, 180), slice(110, 190))):
+        part = diffuse(WarpMap(warp[cut] - (0, cut.start), error[cut]), iterations=6).warp
+        inner = slice(kept.start - cut.start, kept.stop - cut.start)
+        assert part[inner] + (0, cut.start) == pytest.approx(whole[kept], abs=1e-4)
+
+
 def test_nothing_known_stays_unknown() -> None:
     nothing = WarpMap(np.full((8, 9, 2), np.nan, np.float32), np.full((8, 9), np.inf, np.float32))
     assert np.isnan(diffuse(nothing).warp).all()

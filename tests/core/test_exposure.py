@@ -3,7 +3,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowtool.core.exposure import common_reference, frame_gain, without_gain
+from shadowtool.core.exposure import (
+    RunningGain,
+    common_reference,
+    frame_gain,
+    sampled_areas,
+    without_gain,
+)
 from tests.scene import Scene
 
 SCENE = Scene()
@@ -129,3 +135,63 @@ def test_long_shade_does_not_lower_the_level_of_a_steady_take() -> None:
         samples.append(SCENE.noisy(SCENE.image(beta.astype(np.float32)), i))
     reference = common_reference(samples)
     assert np.median([frame_gain(sample, reference) for sample in samples]) == 1.0
+
+
+def sweep(
+    frames: int, loss: float, width: float, gains: np.ndarray, seed: int = 0
+) -> list[np.ndarray]:
+    """Brightness of a texture over which a soft-edged stick is swept, under changing light."""
+    rng = np.random.default_rng(seed)
+    ground = rng.uniform(0.1, 0.8, (60, 240)).astype(np.float32)
+    x = np.arange(240, dtype=np.float32)
+    pictures = []
+    for frame, gain in enumerate(gains):
+        inside = (280 + width) * frame / frames - 20 - x
+        shade = np.clip(inside / 8, 0, 1) * np.clip((width - inside) / 8, 0, 1)
+        clean = np.float32(gain) * ground * (1 - loss * shade)
+        noise = rng.normal(0, 0.004, ground.shape) * np.sqrt(clean / 0.2)
+        pictures.append((clean + noise).astype(np.float32))
+    return pictures
+
+
+# A thin stick; a board that leaves nothing lit for a while; light that a shadow takes little of.
+@pytest.mark.parametrize(("loss", "width"), [(0.8, 12), (0.8, 400), (0.15, 400), (0.3, 40)])
+def test_exposure_is_followed_past_a_sweep(loss: float, width: float) -> None:
+    frames = np.arange(80)
+    gains = (1 + 0.12 * np.sin(frames / 9)) * (1 + 0.03 * np.sin(2.1 * frames))
+    gains /= gains[0]
+    running = RunningGain()
+    found = [running.add(gray) for gray in sweep(80, loss, width, gains)]
+    assert found[0] == 1
+    assert found == pytest.approx(gains, rel=0.011)
+
+
+@pytest.mark.parametrize(("loss", "width"), [(0.8, 12), (0.8, 400), (0.15, 400), (0.3, 40)])
+def test_under_steady_light_a_sweep_has_no_gain(loss: float, width: float) -> None:
+    running = RunningGain()
+    assert {running.add(gray) for gray in sweep(80, loss, width, np.ones(80))} == {1.0}
+
+
+def test_a_frame_that_is_no_picture_of_the_scene_leaves_the_gain() -> None:
+    running = RunningGain()
+    pictures = sweep(20, 0.8, 12, np.full(20, 1.0))
+    pictures[10:] = [picture * np.float32(1.1) for picture in pictures[10:]]
+    pictures[5] = np.full_like(pictures[5], np.nan)
+    found = [running.add(gray) for gray in pictures]
+    assert found[:10] == [1.0] * 10
+    assert found[10:] == pytest.approx([1.1] * 10, rel=0.005)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (9, 7), (1, 400), (400, 1), (270, 480), (61, 33)])
+def test_sampled_areas_are_means_of_runs(shape: tuple[int, int]) -> None:
+    gray = np.random.default_rng(0).uniform(size=shape).astype(np.float32)
+    areas = sampled_areas(gray)
+    step = max(1, round(max(shape) / 160))
+    run = min(step, shape[1])
+    assert len(areas) == len(gray[::step])
+    assert areas[0, 0] == pytest.approx(gray[0, :run].mean() if shape[1] >= step else gray[0, 0])
+    assert areas[-1, -1] == pytest.approx(
+        gray[::step][-1, (areas.shape[1] - 1) * step :][:run].mean()
+        if shape[1] >= step
+        else gray[::step][-1, 0]
+    )

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -70,10 +71,40 @@ def test_eight_bits_are_not_taken_for_a_codec_that_freezes() -> None:
     assert model_of(shots).sigma(np.full(3, 0.18)) == pytest.approx([true] * 3, rel=0.25)
 
 
+def test_noise_that_a_codec_makes_rare_and_large_is_as_large_as_it_is_far_off() -> None:
+    rng = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(rng.normal(size=(240, 320, 3)), (0, 0), 2)
+    smooth = 0.3 * np.exp(0.5 * texture / texture.std())
+    shots = []
+    for _ in range(16):
+        noisy = smooth + rng.normal(size=smooth.shape) * np.sqrt(SLOPE * smooth + FLOOR)
+        code = np.round(encode_srgb(np.clip(noisy, 0, 1)) * 255).astype(np.uint8)
+        done, stored = cv2.imencode(".jpg", code, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        assert done
+        shots.append(decode_srgb(cv2.imdecode(stored, cv2.IMREAD_COLOR) / 255))
+    middle = np.median(shots, axis=0)
+    off = np.abs(np.array(shots) - middle) / model_of(shots).sigma(middle)
+    # Of normal noise it would be 1 in 370.
+    assert (off > 3).mean() < 1 / 100
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_normal_noise_is_not_taken_for_rare_and_large(moving: bool) -> None:
+    shots = take(24, moving=moving)
+    samples = {n: thin(shots[p]) for n, p in sample_positions(24).items()}
+    levels = noise_levels(samples)
+    assert {type(level.sigma) for level in levels} == {float}
+    sigmas = np.array([level.sigma for level in levels])
+    values = np.array([level.value for level in levels])
+    wanted = np.sqrt(SLOPE * values + FLOOR)
+    assert np.median(sigmas / wanted) == pytest.approx(1, abs=0.12)
+
+
 def test_rounding_to_code_values_counts_as_noise() -> None:
     step = 1 / 255
     coarse = [np.round(shot / step) * step for shot in take(24)]
-    assert model_of(coarse).sigma(np.full(3, 0.02)) == pytest.approx([step / 12**0.5] * 3, rel=0.2)
+    true = np.sqrt(SLOPE * 0.02 + FLOOR + step**2 / 12)
+    assert model_of(coarse).sigma(np.full(3, 0.02)) == pytest.approx([true] * 3, rel=0.2)
 
 
 def test_frames_with_nothing_finite_are_passed_over() -> None:
@@ -95,7 +126,7 @@ def test_samples_of_a_take_of_unknown_length_stay_few_and_spread(frames: int) ->
     for number in range(frames):
         kept.add(np.full((2, 2, 3), number, np.float32))
     samples = kept.samples()
-    numbers = [int(image[0, 0]) for _, image in sorted(samples.items())]
+    numbers = [int(image[0, 0, 0]) for _, image in sorted(samples.items())]
     assert 2 <= len(numbers) <= 36
     assert all(b == a + 1 for a, b in zip(numbers[::2], numbers[1::2], strict=False))
     assert numbers[-1] >= frames * 0.7 - 2

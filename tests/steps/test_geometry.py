@@ -23,12 +23,13 @@ SWEEPS = {
 }
 
 
-def shoot(folder: Path, sweep: Sweep) -> Path:
-    """The noisy frames of a sweep."""
+def shoot(folder: Path, sweep: Sweep, swing: float = 0.0) -> Path:
+    """The noisy frames of a sweep, under light that swings by a part of itself."""
     header = Header(SCENE.width, SCENE.height)
     folder.mkdir(parents=True)
     for frame in range(SCENE.frames_of(sweep)):
         image = SCENE.noisy(SCENE.image(SCENE.sweep_beta(sweep, frame)), frame)
+        image *= np.float32(1 + swing * np.sin(frame / 3))
         write_exr(folder / f"take.{1001 + frame}.exr", {"RGB": to_half(image)}, header)
     return folder
 
@@ -75,6 +76,20 @@ def test_w_is_found_to_a_fraction_of_a_pixel(scans: list[Path], tmp_path: Path, 
     assert (error[sure] < 1).mean() > 0.9
     # The block's displacement is the same everywhere: its light is infinitely far away.
     assert np.abs(result.figures["light"]["at"]).max() > 1000
+
+
+def test_light_that_changes_moves_no_time(scans: list[Path], tmp_path: Path, mask: str) -> None:
+    frames = shoot(tmp_path / "frames", SWEEPS["first"], swing=0.1)
+    result = scan(frames, tmp_path / "corrected", plane=mask)
+    assert result.figures["gain"]["least"] < 0.92 < 1.08 < result.figures["gain"]["most"]
+    scan(frames, tmp_path / "as-is", plane=mask, gain="none")
+    steady = read_scan(scans[0])[0].times.time
+    off = {}
+    for name in ("corrected", "as-is"):
+        change = np.abs(read_scan(tmp_path / name)[0].times.time - steady)
+        off[name] = np.nanpercentile(change, 90)
+    assert off["corrected"] < 0.05
+    assert off["corrected"] < off["as-is"] / 3
 
 
 def test_a_source_that_stands_like_the_target_needs_no_map(

@@ -68,14 +68,14 @@ def _closed_in(ratios: Float32, centre: float, spread: float = 0.0) -> float:
     return centre
 
 
-def sampled_areas(gray: Float32) -> Float32:
+def sampled_areas(gray: NDArray[np.floating]) -> Float32:
     """Means of runs of pixels in evenly spaced rows, (H, W) to (h, w); what is left over at the
     right is left out."""
     step = max(1, round(max(gray.shape) / _AREAS))
     width = gray.shape[1] // step
     if width == 0:
-        return gray[::step, :1].copy()
-    runs = gray[::step, : width * step].reshape(-1, width, step)
+        return np.array(gray[::step, :1], np.float32)
+    runs = to_float(gray[::step, : width * step]).reshape(-1, width, step)
     return np.asarray(np.einsum("ijk->ij", runs) / np.float32(step), np.float32)
 
 

@@ -4,16 +4,15 @@ An edge sharper than its own step falls between two frames; where, only those pi
 frame caught half-way. How long the edge takes to pass a pixel is told by how many were caught.
 """
 
-from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
-from shadowtool.core.half_floats import to_float
+from shadowtool.core.crossings import LEAST_CONTRAST, Crossings
+from shadowtool.core.half_floats import rounded, to_float
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plane_fits import Windows, fit_planes
 
@@ -38,12 +37,6 @@ _PROFILE, _LEAST_ERROR = 0.1, 0.01
 _SHARP, _SOFT = 0.6, 1.0
 # Standard deviation of a time of which only the interval between two frames is known.
 INTERVAL_ERROR = 1 / np.sqrt(12)
-# Of what was brighter than this part of the lit value nothing is kept while a pass is read; so the
-# crossing of pixels that lose less than twice as much in all may not be found.
-_NEARLY_LIT = np.float32(0.96)
-LEAST_CONTRAST = 2 * (1 - float(_NEARLY_LIT))
-# How many frames are kept meanwhile.
-_KEPT_BYTES, _LEAST_KEPT, _MOST_KEPT = 2**28, 6, 24
 # Half the widths of the windows in which times are taken for linear, pixels.
 _RADII = (2, 5)
 _WINDOWS = Windows(_RADII)
@@ -86,181 +79,12 @@ def luminance(image: NDArray[np.floating]) -> Float32:
     return gray
 
 
-class Crossings(NamedTuple):
-    """Between which two frames each pixel's luminance first fell below (I_min + I_max) / 2.
-
-    Attributes:
-        at: (H, W) int32, position of the later frame among those looked at, ≥ 1; 0 unknown.
-        before, after: (H, W) float32, luminance in the frame before and in that one.
-        lowest, highest: (H, W) float32, I_min and I_max of the pass.
-        lost: (H, W) bool, unknown only because the frame that would tell was no longer kept.
-        frames: how many were looked at.
-    """
-
-    at: NDArray[np.int32]
-    before: Float32
-    after: Float32
-    lowest: Float32
-    highest: Float32
-    lost: Bool
-    frames: int
-
-
-class CrossingFinder:
-    """Finds each pixel's first crossing of the half-way threshold in one reading of the pass.
-
-    The threshold is known only at the end. But as long as nothing was darker than it is so far, the
-    crossing lies ahead, and a frame that is darker than it, is it. Only while an edge passes, and
-    the threshold sinks with it, the crossing moves on to a frame after the first: that one is
-    looked up among the last few, which are kept.
-
-    What follows the leading edge makes no difference. A pixel that is below the threshold from the
-    start has no crossing that was seen: unknown. Of pixels that never lose `LEAST_CONTRAST` of
-    their light, crossings may be wrong.
-    """
-
-    def __init__(self, kept: int | None = None) -> None:
-        """Args: how many frames are kept; an edge may take about twice as many to pass. None for
-        as many as are no burden to memory."""
-        self._kept = kept
-        self._recent: deque[Float32] = deque()
-        self._frames = 0
-
-    def add(self, gray: Float32) -> None:
-        """Take in one frame's luminance, (H, W), in the order of the pass.
-
-        Where it isn't finite the last value that was stands.
-        """
-        gray = np.ascontiguousarray(gray, np.float32)
-        finite = np.isfinite(gray)
-        if not finite.all():
-            last = self._recent[-1] if self._recent else np.full_like(gray, np.nan)
-            gray = np.where(finite, gray, last)
-        if self._frames:
-            self._look(gray)
-        else:
-            self._shape = gray.shape
-            if self._kept is None:
-                self._kept = min(max(_KEPT_BYTES // gray.nbytes, _LEAST_KEPT), _MOST_KEPT)
-            self._recent = deque(maxlen=self._kept + 2)
-            self._low, self._high = gray.ravel().copy(), gray.ravel().copy()
-            # The lowest a frame ago; and the lowest before the frame before the crossing.
-            self._lower, self._floor = (np.full(gray.size, np.nan, np.float32) for _ in range(2))
-            # As if all had crossed in the first frame, before which nothing is known.
-            self._after = self._low.copy()
-            self._before, self._earlier, self._next = (self._lower.copy() for _ in range(3))
-            self._moved = np.arange(gray.size)
-            self._darker = np.arange(gray.size)
-            self._unseen = bool(np.isnan(self._low).any())
-            self._at = np.zeros(gray.size, np.int32)
-            self._lost = np.zeros(gray.size, bool)
-        self._recent.append(gray)
-        self._frames += 1
-
-    def found(self) -> Crossings:
-        """What was found.
-
-        Raises:
-            ValueError: no frame was looked at.
-        """
-        if not self._frames:
-            raise ValueError("no frame was looked at")
-        threshold = (self._low + self._high) / 2
-        at, after, before = self._at.copy(), self._after.copy(), self._before.copy()
-        with np.errstate(invalid="ignore"):
-            # Light that grew after the crossing has raised the threshold: it lies earlier.
-            lost = self._lost | (self._floor < threshold)
-            late = (before < threshold) & ~lost
-        at[late] -= 1
-        after[late], before[late] = before[late], self._earlier[late]
-        at[lost | ~np.isfinite(before)] = 0
-
-        def plane(values: NDArray[Any]) -> NDArray[Any]:
-            return values.reshape(self._shape)
-
-        ends, extremes = (plane(before), plane(after)), (plane(self._low), plane(self._high))
-        return Crossings(plane(at), *ends, *extremes, plane(lost), self._frames)
-
-    def _look(self, gray: Float32) -> None:
-        """Only where a frame is the darkest so far can the crossing move."""
-        now = gray.ravel()
-        low, high, after = self._low, self._high, self._after
-        self._next[self._moved] = now[self._moved]
-        np.fmax(high, now, out=high)
-        darker = np.flatnonzero(now < low)
-        values, lit = now[darker], high[darker]
-        # What is nearly as bright as it ever was crosses no threshold that matters in the end; and
-        # the crossing found last stands as long as the threshold is above it.
-        threshold = (lit + values) / np.float32(2)
-        crossed = (values < _NEARLY_LIT * lit) & ~(after[darker] < threshold)
-        some, threshold = darker[crossed], threshold[crossed]
-        fresh = low[some] >= np.minimum(threshold, _NEARLY_LIT * lit[crossed])
-        begun = some[fresh]
-        self._take(begun, 0, now)
-        self._lost[begun] = False
-        self._floor[begun] = self._lower[begun]
-        self._lower[self._darker] = low[self._darker]
-        low[darker] = values
-        self._darker = darker
-        if self._unseen:
-            first = np.flatnonzero(np.isnan(low) & ~np.isnan(now))
-            low[first] = now[first]
-            self._unseen = bool(np.isnan(low).any())
-            self._darker = np.concatenate([darker, first])
-        old, threshold = some[~fresh], threshold[~fresh]
-        onward = self._next[old] < threshold
-        self._shift(old[onward])
-        self._moved = np.concatenate([begun, self._search(old[~onward], threshold[~onward], now)])
-
-    def _take(self, pixels: NDArray[np.intp], ago: int, now: Float32) -> None:
-        """Put the crossing of these pixels into the frame so many ago."""
-
-        def values(ago: int) -> Float32:
-            if ago == 0:
-                return now[pixels]
-            if ago > len(self._recent):
-                return np.full(len(pixels), np.nan, np.float32)
-            return self._recent[-ago].ravel()[pixels]
-
-        self._at[pixels] = self._frames - ago
-        self._after[pixels], self._before[pixels] = values(ago), values(ago + 1)
-        self._earlier[pixels] = values(ago + 2)
-        self._next[pixels] = values(ago - 1) if ago else np.nan
-
-    def _shift(self, pixels: NDArray[np.intp]) -> None:
-        """Move the crossing of these pixels on by a frame."""
-        self._at[pixels] += 1
-        self._floor[pixels] = np.fmin(self._floor[pixels], self._before[pixels])
-        self._earlier[pixels], self._before[pixels] = self._before[pixels], self._after[pixels]
-        self._after[pixels], self._next[pixels] = self._next[pixels], np.nan
-
-    def _search(
-        self, pixels: NDArray[np.intp], threshold: Float32, now: Float32
-    ) -> NDArray[np.intp]:
-        """Move the crossing to the first frame below the threshold, among those still kept.
-
-        Returns:
-            The pixels whose crossing is in the frame under way.
-        """
-        kept = min(self._kept or 0, len(self._recent))
-        old = self._at[pixels]
-        # What passed between the old crossing and the frames that are kept can't be told.
-        self._lost[pixels] |= self._frames - old > kept + 1
-        floor = np.fmin(self._floor[pixels], self._before[pixels])
-        above = self._after[pixels]
-        for ago in range(kept, -1, -1):
-            values = (now if ago == 0 else self._recent[-ago].ravel())[pixels]
-            later = self._frames - ago > old
-            below = later & (values < threshold)
-            self._take(pixels[below], ago, now)
-            self._floor[pixels[below]] = floor[below]
-            if ago == 0:
-                return pixels[below]
-            floor = np.where(later, np.fmin(floor, above), floor)
-            above = np.where(later, values, above)
-            pixels, threshold, old = pixels[~below], threshold[~below], old[~below]
-            floor, above = floor[~below], above[~below]
-        return pixels[:0]
+def luminance_halfs(image: NDArray[np.floating]) -> NDArray[np.float16]:
+    """`luminance`, rounded to halfs; infinite where it is too large for one."""
+    gray = np.empty(image.shape[:2], np.float16)
+    for rows in bands(image.shape):
+        gray[rows] = rounded(luminance(image[rows]))
+    return gray
 
 
 def significant(crossings: Crossings, noise: NoiseModel) -> Crossings:

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Gain
 from shadowtool.core.bands import overlapping_bands
+from shadowtool.core.crossings import CrossingFinder, Crossings
 from shadowtool.core.exposure import RunningGain, sampled_areas
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.pictures import time_picture
 from shadowtool.core.shadow_lines import (
@@ -23,10 +25,8 @@ from shadowtool.core.shadow_lines import (
 )
 from shadowtool.core.shadow_time import (
     SHADE,
-    CrossingFinder,
-    Crossings,
     ShadowTimes,
-    luminance,
+    luminance_halfs,
     own_times,
     refined_times,
     significant,
@@ -54,6 +54,7 @@ from shadowtool.steps.run import (
 
 logger = logging.getLogger(__name__)
 
+Float16 = NDArray[np.float16]
 Float32 = NDArray[np.float32]
 PICTURE = "scan.png"
 
@@ -140,7 +141,7 @@ def _crossings(
     the frames that could be read."""
     samples = sample_positions(len(frames))
 
-    def read(position: int) -> tuple[Float32, Float32, Float32 | None, str] | None:
+    def read(position: int) -> tuple[Float16, Float32, Float32 | None, str] | None:
         try:
             image = footage.image(frames[position])
         except DamagedFileError:
@@ -149,7 +150,7 @@ def _crossings(
             raise
         values = image.rgb(footage.transfer)
         sample = thin(values) if position in samples.values() else None
-        gray = luminance(values)
+        gray = luminance_halfs(values)
         return gray, sampled_areas(gray), sample, image.fingerprint
 
     finder, exposure = CrossingFinder(), RunningGain()
@@ -160,7 +161,7 @@ def _crossings(
         if item is not None:
             gray, areas, sample, mark = item
             own = exposure.add(areas) if gain == "auto" else 1.0
-            finder.add(gray if own == 1 else gray / np.float32(own))
+            finder.add(gray if own == 1 else to_float(gray) / np.float32(own))
             marks.append(mark)
             gains[frames[position]] = own
             if sample is not None:

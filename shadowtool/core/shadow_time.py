@@ -184,7 +184,11 @@ def time_windows(time: Float32, plane: Bool) -> Windows:
 
 
 def refined_times(
-    time: Float32, error: Float32, at: NDArray[np.int32], windows: Windows = _WINDOWS
+    time: Float32,
+    error: Float32,
+    at: NDArray[np.int32],
+    windows: Windows = _WINDOWS,
+    wanted: slice = slice(None),
 ) -> tuple[Float32, Float32]:
     """Times as the pixels around tell them too, each within its own interval between two frames.
 
@@ -192,12 +196,15 @@ def refined_times(
         time, error: (H, W) float32 from `own_times`.
         at: (H, W) from `Crossings`.
         windows: in which times are taken for linear.
+        wanted: rows; no others are worked out.
 
     Returns:
-        Positions among the frames and their predicted errors; (H, W) float32 each.
+        Positions among the frames and their predicted errors; (H, W) float32 each, of the rows
+        wanted.
     """
-    fitted, spread = fit_planes(time, error, windows)
-    return np.clip(fitted, at - 1, at).astype(np.float32), spread
+    fitted, spread = fit_planes(time, error, windows, wanted)
+    late = at[wanted].astype(np.float32)
+    return np.clip(fitted, late - 1, late, out=fitted), spread
 
 
 def usual_loss(contrast: Float32, highest: Float32, known: Bool, plane: Bool) -> Float32:

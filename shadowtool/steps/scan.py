@@ -191,14 +191,13 @@ def _times(
     time, error = np.empty_like(own), np.empty_like(own_error)
     windows = time_windows(own, region)
 
-    def refine(band: tuple[slice, slice]) -> tuple[slice, slice, tuple[Float32, Float32]]:
+    def refine(band: tuple[slice, slice]) -> None:
         rows, inner = band
-        found = refined_times(own[rows], own_error[rows], crossings.at[rows], windows)
-        return rows, inner, found
+        found = refined_times(own[rows], own_error[rows], crossings.at[rows], windows, inner)
+        time[rows][inner], error[rows][inner] = found
 
-    for rows, inner, found in ordered_map(refine, overlapping_bands(len(own), windows.reach), jobs):
-        for whole, part in zip((time, error), found, strict=True):
-            whole[rows][inner] = part[inner]
+    for _ in ordered_map(refine, overlapping_bands(len(own), windows.reach), jobs):
+        pass
     # From positions among the frames to frame numbers, which may be further apart.
     spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))
     return ShadowTimes(

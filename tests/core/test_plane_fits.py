@@ -103,6 +103,15 @@ def test_bands_of_the_picture_give_the_same() -> None:
     assert np.array_equal(part_spread[REACH:], spread[first:])
 
 
+def test_rows_alone_are_those_of_the_whole() -> None:
+    value, error = measured(np.hypot(ROWS, COLUMNS), 0.5)
+    whole, spread = fit_planes(value, error)
+    for wanted in (slice(0, 1), slice(7, 31), slice(50, 60)):
+        part, part_spread = fit_planes(value, error, wanted=wanted)
+        assert np.array_equal(part, whole[wanted])
+        assert np.array_equal(part_spread, spread[wanted])
+
+
 def test_windows_grow_with_the_step() -> None:
     assert Windows.for_step(10) == Windows()
     assert Windows.for_step(36) == Windows(tuple(3 * radius for radius in RADII), 3.0)

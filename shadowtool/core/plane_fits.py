@@ -158,8 +158,8 @@ def _added(total: Float32, part: Float32, sign: int) -> None:
 
 
 class _Choice(NamedTuple):
-    """Value and variance of what was chosen so far, and between what a plane's value has to lie;
-    (H, W) float32 each."""
+    """Value and variance of what was chosen so far, and between what a plane's value has to lie to
+    agree with the pixel's own; (H, W) float32 each."""
 
     value: Float32
     variance: Float32
@@ -175,6 +175,10 @@ def _choose(planes: _Planes, radius: int, first: int, chosen: _Choice) -> None:
     """
     best, spread, least, most = chosen
     rows = slice(first, first + len(best))
+    # And with what smaller windows told.
+    allowed = np.sqrt(spread)
+    allowed *= np.float32(_AGREES)
+    least, most = np.maximum(least, best - allowed), np.minimum(most, best + allowed)
     for row, column in np.ndindex(3, 3):
         y, x = row - 1, column - 1
         # The window's centre lies (x, y) ahead, so the pixel lies (-x, -y) off it.
@@ -186,10 +190,6 @@ def _choose(planes: _Planes, radius: int, first: int, chosen: _Choice) -> None:
         # Many times faster than numpy's own where it goes now one way, now the other.
         cv2.copyTo(value, better.view(np.uint8), best[here])
         cv2.copyTo(variance, better.view(np.uint8), spread[here])
-    allowed = np.sqrt(spread)
-    allowed *= np.float32(_AGREES)
-    np.maximum(least, best - allowed, out=least)
-    np.minimum(most, best + allowed, out=most)
 
 
 def _planes(value: Float64, weight: Float64, radius: int, factor: float) -> _Planes:

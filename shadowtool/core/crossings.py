@@ -56,6 +56,10 @@ class Crossings(NamedTuple):
     lost: Bool
     frames: int
 
+    def part(self, rows: slice) -> "Crossings":
+        """Some rows; nothing is copied."""
+        return Crossings._make([*(values[rows] for values in self[:-1]), self.frames])
+
 
 class _State(NamedTuple):
     """What is known of each pixel, (P,); luminances as keys.

@@ -5,6 +5,7 @@ frame caught half-way. How long the edge takes to pass a pixel is told by how ma
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,6 +32,8 @@ _CAUGHT, _LEAST_CAUGHT = 3.0, 0.04
 _BINS, _CERTAIN, _TOO_OFTEN = 50, 0.2, 2.0
 # Half the window in which an edge is taken to last equally long, pixels.
 _LOCAL = 15
+# So many arrays of pixels are worked on together; rows that tell how fast an edge moves.
+_ARRAYS, _SLOPE_ROWS = 12, 256
 # How well an edge's profile is known, as a part of its duration; and the least error, frames.
 _PROFILE, _LEAST_ERROR = 0.1, 0.01
 # From the first duration on, in frames, to the second, interpolation between the frames takes over.
@@ -89,13 +92,15 @@ def luminance_halfs(image: NDArray[np.floating]) -> NDArray[np.float16]:
 
 def significant(crossings: Crossings, noise: NoiseModel) -> Crossings:
     """Crossings without those of pixels whose minimum and maximum may be nothing but noise."""
-    contrast = crossings.highest - crossings.lowest
-    least = _sigma(crossings.highest, noise) * max(float(extreme_range(crossings.frames)), 8.0)
-    with np.errstate(invalid="ignore"):
-        seen = contrast > np.maximum(least, LEAST_CONTRAST * crossings.highest)
-    return crossings._replace(
-        at=np.where(seen, crossings.at, 0).astype(np.int32), lost=crossings.lost & seen
-    )
+    sigmas = max(float(extreme_range(crossings.frames)), 8.0)
+    at, lost = np.empty_like(crossings.at), np.empty_like(crossings.lost)
+    for rows in bands(at.shape, _ARRAYS):
+        highest = crossings.highest[rows]
+        least = np.maximum(_sigma(highest, noise) * sigmas, LEAST_CONTRAST * highest)
+        seen = highest - crossings.lowest[rows] > least
+        at[rows] = crossings.at[rows] * seen
+        lost[rows] = crossings.lost[rows] & seen
+    return crossings._replace(at=at, lost=lost)
 
 
 def interpolated_times(crossings: Crossings) -> Float32:
@@ -126,41 +131,85 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
         NaN and infinite where unknown.
     """
     known = crossings.at > 0
-    # The extremes of noise lie beyond what was lit and dark.
+    lost, left, passing = (np.empty(known.shape, np.float32) for _ in range(3))
+    counts = np.zeros((2, _BINS))
+    cuts = list(bands(known.shape, _ARRAYS))
+    for rows in cuts:
+        part = crossings.part(rows)
+        lit, dark, contrast, *sigmas = _extremes(part, noise)
+        ends = (lost, lit - part.before), (left, part.after - dark)
+        for (values, of), count, sigma in zip(ends, counts, sigmas, strict=True):
+            seen = np.minimum(np.fmax(of / contrast, 0), 1)
+            count += _counts(seen, known[rows])
+            # Not caught is as good as not on its way.
+            np.multiply(seen, known[rows] & (seen > _CAUGHT * sigma), out=values[rows])
+    least = [np.float32(_least_caught(count)) for count in counts]
+    for rows in cuts:
+        total = passing[rows]
+        total[:] = 0
+        for values, enough in zip((lost[rows], left[rows]), least, strict=True):
+            values *= values > enough
+            total += values * (1 - values)
+    duration = _local_mean(passing, known)
+    time, error = np.empty_like(lost), np.empty_like(lost)
+    for rows in cuts:
+        caught = lost[rows], left[rows]
+        told = _told(crossings.part(rows), noise, caught, 6 * duration[rows])
+        time[rows] = np.where(known[rows], told[0], np.float32(np.nan))
+        error[rows] = np.where(known[rows], told[1], np.float32(np.inf))
+    return time, error
+
+
+def _extremes(
+    crossings: Crossings, noise: NoiseModel
+) -> tuple[Float32, Float32, Float32, Float32, Float32]:
+    """Luminance lit and dark, their difference, and the standard deviations of both in its unit."""
     lit_sigma = _sigma(crossings.highest, noise)
     dark_sigma = _sigma(crossings.lowest, noise)
+    # The extremes of noise lie beyond what was lit and dark.
     beyond = np.float32(_largest(crossings.frames / 2))
     lit = crossings.highest - beyond * lit_sigma
     dark = crossings.lowest + beyond * dark_sigma
-    contrast = np.maximum(lit - dark, 1e-6)
-    lit_sigma, dark_sigma = lit_sigma / contrast, dark_sigma / contrast
-    with np.errstate(invalid="ignore"):
-        lost = np.clip((lit - crossings.before) / contrast, 0, 1)
-        left = np.clip((crossings.after - dark) / contrast, 0, 1)
-    caught_before = known & (lost > np.maximum(_CAUGHT * lit_sigma, _least_caught(lost[known])))
-    caught_after = known & (left > np.maximum(_CAUGHT * dark_sigma, _least_caught(left[known])))
-    lost, left = np.where(caught_before, lost, 0), np.where(caught_after, left, 0)
-    duration = 6 * _local_mean(lost * (1 - lost) + left * (1 - left), known)
+    contrast = np.maximum(lit - dark, np.float32(1e-6))
+    return lit, dark, contrast, lit_sigma / contrast, dark_sigma / contrast
+
+
+def _told(
+    crossings: Crossings,
+    noise: NoiseModel,
+    caught: tuple[Float32, Float32],
+    duration: Float32,
+) -> tuple[Float32, Float32]:
+    """Times and errors of known pixels.
+
+    Args:
+        caught: what part of the light was lost in the frame before, and what was left in the one
+            after the crossing; 0 where the edge was not caught on its way.
+        duration: frames that the edge takes to pass, around each pixel.
+    """
+    lost, left = caught
+    _, _, _, lit_sigma, dark_sigma = _extremes(crossings, noise)
     sharp = np.minimum(duration, 1)
+    half, one = np.float32(0.5), np.float32(1)
     # Midway between the frames, unless one of them caught it.
     late = crossings.at.astype(np.float32)
-    time, error = late - 0.5, np.maximum(1 - sharp, 0.1) * np.float32(INTERVAL_ERROR)
-    for caught, other, at, sigma in (
-        (caught_before, caught_after, late - 1 + (0.5 - lost) * sharp, lit_sigma),
-        (caught_after, caught_before, late - (0.5 - left) * sharp, dark_sigma),
+    time, error = late - half, np.maximum(one - sharp, 0.1) * np.float32(INTERVAL_ERROR)
+    both = (lost > 0) & (left > 0)
+    for part, at, sigma in (
+        (lost, late - one + (half - lost) * sharp, lit_sigma),
+        (left, late - (half - left) * sharp, dark_sigma),
     ):
-        alone = caught & ~other
-        np.copyto(time, at, where=alone)
-        np.copyto(error, sharp * np.hypot(sigma, _PROFILE) + _LEAST_ERROR, where=alone)
-    straight = np.nan_to_num(interpolated_times(crossings))
-    scatter = np.hypot(lit_sigma, dark_sigma) / 2
-    soft = np.where(
-        caught_before & caught_after, 1, np.clip((duration - _SHARP) / (_SOFT - _SHARP), 0, 1)
-    )
+        alone = ((part > 0) & ~both).view(np.uint8)
+        spread = sharp * np.sqrt(sigma * sigma + np.float32(_PROFILE**2)) + np.float32(_LEAST_ERROR)
+        cv2.copyTo(at, alone, time)
+        cv2.copyTo(spread, alone, error)
+    straight = interpolated_times(crossings)
+    scatter = np.sqrt(lit_sigma * lit_sigma + dark_sigma * dark_sigma) / 2
+    soft = np.clip((duration - _SHARP) / (_SOFT - _SHARP), 0, 1)
+    np.maximum(soft, both, out=soft)
     time += soft * (straight - time)
     error += soft * (np.maximum(duration, 1) * scatter + 3 * _LEAST_ERROR - error)
-    time = np.where(known, np.clip(time, late - 1, late), np.nan)
-    return time.astype(np.float32), np.where(known, error, np.inf).astype(np.float32)
+    return np.clip(time, late - one, late), error
 
 
 def time_windows(time: Float32, plane: Bool) -> Windows:
@@ -172,9 +221,15 @@ def time_windows(time: Float32, plane: Bool) -> Windows:
         plane: (H, W), the reference plane region.
     """
     slopes = []
-    for axis in (0, 1):
-        slope = np.diff(time, axis=axis)
-        both = plane[1:] & plane[:-1] if axis == 0 else plane[:, 1:] & plane[:, :-1]
+    # A few rows are enough, each with the one below it.
+    every = max(1, len(time) // _SLOPE_ROWS)
+    above, below = time[:-1:every], time[1::every]
+    inside, inside_below = plane[:-1:every], plane[1::every]
+    for first, second, both in (
+        (above, below, inside & inside_below),
+        (above[:, :-1], above[:, 1:], inside[:, :-1] & inside[:, 1:]),
+    ):
+        slope = second - first
         # Larger steps are from one thing to another.
         with np.errstate(invalid="ignore"):
             slope = slope[both & (np.abs(slope) < 2)]
@@ -229,13 +284,22 @@ def usual_loss(contrast: Float32, highest: Float32, known: Bool, plane: Bool) ->
     return np.asarray(np.clip(part / max(float(np.median(usual)), 1e-6), 0, 1), np.float32)
 
 
-def _least_caught(part: Float32) -> float:
+def _counts(part: Float32, known: Bool) -> NDArray[np.float32]:
+    """How many of the known pixels have which part of the contrast, up to a half of it."""
+    counts = cv2.calcHist([part], [0], known.view(np.uint8), [_BINS], [0.0, 0.5])
+    return np.asarray(counts, np.float32).ravel()
+
+
+def _least_caught(counts: NDArray[np.floating]) -> float:
     """Below which part of the contrast a value may well be an error and no edge on its way.
 
     A flank passes all values about equally fast; where far more pixels have a value than that, most
     of them were lit or dark.
+
+    Args:
+        counts: from `_counts`.
     """
-    counts, edges = np.histogram(part, bins=_BINS, range=(0.0, 0.5))
+    edges = np.linspace(0, 0.5, _BINS + 1)
     certain = edges[:-1] >= _CERTAIN
     often = counts > _TOO_OFTEN * max(float(np.median(counts[certain])), 1.0)
     often[certain] = False
@@ -247,8 +311,10 @@ def _sigma(gray: Float32, noise: NoiseModel) -> Float32:
     """Standard deviation of the luminance ``gray``, (H, W)."""
     weights = LUMA.astype(np.float64) ** 2
     slope, floor = float(weights @ noise.slope), float(weights @ noise.floor)
-    variance = np.maximum(np.nan_to_num(gray), 0) * np.float32(slope) + np.float32(floor)
-    return np.asarray(np.sqrt(variance), np.float32)
+    # Of NaN and 0 it gives 0.
+    variance = np.fmax(gray, 0) * np.float32(slope)
+    variance += np.float32(floor)
+    return np.asarray(np.sqrt(variance, out=variance), np.float32)
 
 
 def _largest(count: float) -> float:
@@ -257,12 +323,15 @@ def _largest(count: float) -> float:
     return float(reach - (np.log(np.log(max(count, 3))) + np.log(4 * np.pi)) / (2 * reach))
 
 
-def _local_mean(values: Float32, known: NDArray[np.bool_]) -> Float32:
-    """Mean over the known pixels around each."""
+def _local_mean(values: Float32, known: Bool) -> Float32:
+    """Mean over the known pixels around each; the others are 0."""
     size = (2 * _LOCAL + 1, 2 * _LOCAL + 1)
-    values = np.where(known, values, 0).astype(np.float32)
-    total = cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    count = cv2.boxFilter(
-        known.astype(np.float32), -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT
-    )
-    return np.asarray(total / np.maximum(count, 1), np.float32)
+
+    def total(image: NDArray[Any]) -> NDArray[Any]:
+        return cv2.boxFilter(
+            image, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+
+    mean, count = total(values), total(known.view(np.uint8))
+    mean /= np.maximum(count, 1, out=count)
+    return np.asarray(mean, np.float32)

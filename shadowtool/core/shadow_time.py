@@ -32,8 +32,9 @@ _CAUGHT, _LEAST_CAUGHT = 3.0, 0.04
 _BINS, _CERTAIN, _TOO_OFTEN = 50, 0.2, 2.0
 # Half the window in which an edge is taken to last equally long, pixels.
 _LOCAL = 15
-# So many arrays of pixels are worked on together; rows that tell how fast an edge moves.
-_ARRAYS, _SLOPE_ROWS = 12, 256
+# So many arrays of pixels are worked on together; about so many rows tell how fast an edge moves,
+# and pixels what they usually lose.
+_ARRAYS, _SLOPE_ROWS, _USUAL = 12, 256, 100_000
 # How well an edge's profile is known, as a part of its duration; and the least error, frames.
 _PROFILE, _LEAST_ERROR = 0.1, 0.01
 # From the first duration on, in frames, to the second, interpolation between the frames takes over.
@@ -276,12 +277,15 @@ def usual_loss(contrast: Float32, highest: Float32, known: Bool, plane: Bool) ->
     Returns:
         (H, W) float32 in [0, 1]; all 1 if nothing is known on the plane.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        part = np.nan_to_num(contrast / highest, posinf=0.0, neginf=0.0)
+    part = contrast / np.maximum(highest, np.float32(1e-30))
+    part[~(highest > 0)] = 0
     usual = part[plane & known]
     if not usual.size:
         return np.ones(contrast.shape, np.float32)
-    return np.asarray(np.clip(part / max(float(np.median(usual)), 1e-6), 0, 1), np.float32)
+    # As many as tell a median well.
+    middle = float(np.median(usual[:: max(1, usual.size // _USUAL)]))
+    part /= np.float32(max(middle, 1e-6))
+    return np.minimum(part, 1, out=part)
 
 
 def _counts(part: Float32, known: Bool) -> NDArray[np.float32]:

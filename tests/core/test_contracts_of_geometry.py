@@ -194,7 +194,7 @@ CONTRACTS = {
         ),
     ),
     "time_picture": Contract(
-        lambda image, time, turned: pictures.time_picture(image, time, turned[0]),
+        lambda image, time, turned: pictures.time_picture(pictures.display(image), time, turned[0]),
         lambda h, w: st.tuples(picture(h, w), plane(h, w, SOME), turning(h, w)),
         lambda r, image, *others: r.dtype == np.uint8 and r.shape == image.shape,
     ),

@@ -62,9 +62,13 @@ def _agreed(ratios: Float32) -> float | None:
 
 def _closed_in(ratios: Float32, centre: float, spread: float = 0.0) -> float:
     """The middle of those near the centre; no nearer than they scatter."""
+    ordered = np.sort(ratios)
     for width in _NEAR:
-        members = ratios[np.abs(ratios - centre) < max(width, spread)]
-        centre = float(np.median(members)) if members.size else centre
+        reach = max(width, spread)
+        first, last = np.searchsorted(ordered, (centre - reach, centre + reach))
+        # Their median, as they are in order.
+        middle = ordered[(first + last - 1) // 2 : (first + last) // 2 + 1]
+        centre = float(middle.mean()) if last > first else centre
     return centre
 
 

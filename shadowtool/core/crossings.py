@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.half_floats import all_finite, rounded, to_float
+from shadowtool.core.half_floats import rounded, to_float
 from shadowtool.core.half_keys import from_keys, to_keys
 
 Float32 = NDArray[np.float32]
@@ -30,9 +30,10 @@ _NEARLY_LIT_KEYS = np.int16(41)
 _BYTES, _LEAST, _MOST = 2**28, 8, 32
 _WAITING = 1 / 4
 # Pixels that are looked at together, so that all that is known of them is in the cache.
-_BLOCK = 1 << 17
+_BLOCK = 1 << 18
 # The key of NaN, beyond all others; and one below all others.
 _UNKNOWN, _LOWEST = np.int16(0x7E00), np.int16(-0x8000)
+_INFINITE = 0x7C00
 
 
 class Crossings(NamedTuple):
@@ -117,11 +118,12 @@ class CrossingFinder:
 
         Where it is not finite, or too large for a half, the last value that was stands.
         """
-        halfs = np.ascontiguousarray(rounded(gray))
-        keys = to_keys(halfs).ravel()
-        if not all_finite(halfs):
+        halfs = np.ascontiguousarray(rounded(gray)).ravel()
+        keys = halfs.view(np.int16)
+        # Neither negative nor infinite nor NaN: bits are keys.
+        if halfs.view(np.uint16).max() >= _INFINITE:
             last = self._last() if self._frames else np.full_like(keys, _UNKNOWN)
-            keys = np.where(np.isfinite(halfs.ravel()), keys, last)
+            keys = np.where(np.isfinite(halfs), to_keys(halfs), last)
             self._holes = self._holes or bool((keys == _UNKNOWN).any())
         if self._frames:
             self._waiting.append(keys)
@@ -201,14 +203,19 @@ class CrossingFinder:
         self._waiting.clear()
         self._holes = False
 
+    def _raise(self, high: Int16, frame: Int16) -> None:
+        if self._holes:
+            frame = np.where(frame == _UNKNOWN, _LOWEST, frame)
+        np.maximum(high, frame, out=high)
+
     def _look(self, state: _State, seen: Sequence[Int16], new: Sequence[Int16]) -> None:
         """Only where a frame is the darkest so far can the crossing move."""
-        lower = state.low.copy()
+        lower, high = state.low.copy(), state.high
         for frame in new[:-1]:
             np.minimum(lower, frame, out=lower)
-        low, high = np.minimum(lower, new[-1]), state.high
-        for frame in new:
-            np.maximum(high, frame, out=high, where=frame != _UNKNOWN if self._holes else True)
+            self._raise(high, frame)
+        low = np.minimum(lower, new[-1])
+        self._raise(high, new[-1])
         darker = low < np.minimum(state.low, high - _NEARLY_LIT_KEYS)
         if low.min() >= 0:
             # The crossing found last stands as long as the threshold is above it. Keys are concave

@@ -6,6 +6,7 @@ fitted to a window that holds it, but need not be centred on it: of all such win
 plane is known best, among those that the measurements agree with.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from shadowtool.core.bands import bands
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Powers = Sequence[tuple[int, int]]
 
 # Half the windows' widths, pixels, for edges that move up to so many pixels a frame; and the
 # largest for any.
@@ -34,6 +36,8 @@ _COMPANY, _NEAR = 3, 1.0
 _LEVEL = 0.1
 # No plane is known better than this.
 _FLOOR = 0.02
+# From this radius on, sums over windows are made from those over their neighbours.
+_WIDE = 8
 # So many arrays of pixels are worked on together.
 _ARRAYS = 12
 
@@ -198,19 +202,13 @@ def _planes(value: Float64, weight: Float64, radius: int, factor: float) -> _Pla
     Args:
         factor: by how much they are known worse than from independent measurements.
     """
-    ramp = np.arange(-radius, radius + 1, dtype=np.float64)
-    flat = np.ones_like(ramp)
-
-    def moment(image: Float64, across: Float64, down: Float64) -> Float64:
-        total = cv2.sepFilter2D(image, -1, across, down, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(total, np.float64)
-
+    sums = _sums_by_kernels if radius < _WIDE else _sums_by_steps
     weighted = weight * value
+    powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     moments = [
-        *(moment(weight, *k) for k in ((flat, flat), (ramp, flat), (flat, ramp))),
-        *(moment(weight, *k) for k in ((ramp**2, flat), (ramp, ramp), (flat, ramp**2))),
-        *(moment(weighted, *k) for k in ((flat, flat), (ramp, flat), (flat, ramp))),
-        moment(weighted * value, flat, flat),
+        *sums(weight, radius, powers),
+        *sums(weighted, radius, powers[:3]),
+        *sums(weighted * value, radius, powers[:1]),
     ]
     size = (2 * radius + 1, 2 * radius + 1)
     used = (weight > 0).astype(np.float32)
@@ -219,6 +217,54 @@ def _planes(value: Float64, weight: Float64, radius: int, factor: float) -> _Pla
     for rows in bands(value.shape, channels=_ARRAYS):
         _solve([part[rows] for part in moments], count[rows], factor, radius, rows, planes)
     return planes
+
+
+def _sums_by_kernels(image: Float64, radius: int, powers: Powers) -> list[Float64]:
+    """Sums of the image times xᵃyᵇ over the windows around all pixels, x and y counted from
+    there."""
+    ramp = np.arange(-radius, radius + 1, dtype=np.float64)
+    kernels = [ramp**power for power in range(3)]
+    return [
+        np.asarray(
+            cv2.sepFilter2D(image, -1, kernels[a], kernels[b], borderType=cv2.BORDER_CONSTANT)
+        )
+        for a, b in powers
+    ]
+
+
+def _sums_by_steps(image: Float64, radius: int, powers: Powers) -> list[Float64]:
+    """The same in a time that does not grow with the radius: from window to window it is what
+    enters that is added, and what leaves that is taken away."""
+    height, width = image.shape
+    size = (2 * radius + 1, 2 * radius + 1)
+    x = np.arange(width, dtype=np.float64) - width // 2
+    y = np.arange(height, dtype=np.float64)[:, np.newaxis] - height // 2
+    products, sums = {(0, 0): image}, dict[tuple[int, int], Float64]()
+    for a, b in powers:
+        if a:
+            products[a, b] = products[a - 1, b] * x
+        elif b:
+            products[a, b] = products[a, b - 1] * y
+        sums[a, b] = np.asarray(
+            cv2.boxFilter(products[a, b], -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        )
+    # From about the picture's middle to about each window's, the highest powers first.
+    for rows in bands(image.shape, _ARRAYS):
+        part = {power: total[rows] for power, total in sums.items()}
+        down = y[rows]
+        for a, b in reversed(powers):
+            if (a, b) == (1, 1):
+                part[1, 1] -= down * part[1, 0]
+                part[1, 1] -= x * (part[0, 1] - down * part[0, 0])
+            elif a:
+                part[a, b] -= x * part[a - 1, b]
+                if a == 2:
+                    part[a, b] -= x * (part[1, 0] - x * part[0, 0])
+            elif b:
+                part[a, b] -= down * part[a, b - 1]
+                if b == 2:
+                    part[a, b] -= down * (part[0, 1] - down * part[0, 0])
+    return [sums[power] for power in powers]
 
 
 def _solve(

@@ -84,7 +84,7 @@ def fit_planes_one_by_one(
     return best, np.sqrt(spread)
 
 
-@pytest.mark.parametrize("windows", [Windows((1, 2, 3, 5)), Windows((2, 5), 1.7)])
+@pytest.mark.parametrize("windows", [Windows((1, 2, 3, 5)), Windows((2, 5), 1.7), Windows((3, 8))])
 def test_each_pixel_is_given_what_its_windows_in_turn_give_it(windows: Windows) -> None:
     rng = np.random.default_rng(3)
     truth = np.where(COLUMNS < 9, 0.4 * ROWS, 7 - 0.3 * COLUMNS)[:14, :18]

@@ -39,7 +39,7 @@ _FLOOR = 0.02
 # From this radius on, sums over windows are made from those over their neighbours.
 _WIDE = 8
 # So many arrays of pixels are worked on together.
-_ARRAYS = 12
+_ARRAYS = 6
 
 
 @dataclass(frozen=True)
@@ -99,10 +99,12 @@ def fit_planes(
     # A plane may deviate from the measurement by so much.
     allowed = np.where(trusted, _AGREES * np.sqrt(variance), np.inf).astype(np.float32)
     least, most = best - allowed, best + allowed
+    moments = np.empty((10, *value.shape))
     for radius in windows.radii:
         # A pixel's windows are centred up to a radius off it, and end at another.
         start, stop = max(first - 2 * radius, 0), last + 2 * radius
-        planes = _planes(measured[start:stop], weight[start:stop], radius, windows.factor)
+        own, heavy = measured[start:stop], weight[start:stop]
+        planes = _planes(own, heavy, radius, windows.factor, moments[:, : len(own)])
         for rows in bands(best.shape, channels=_ARRAYS):
             chosen = _Choice(*(part[rows] for part in (best, spread, least, most)))
             _choose(planes, radius, rows.start + first - start, chosen)
@@ -196,20 +198,21 @@ def _choose(planes: _Planes, radius: int, first: int, chosen: _Choice) -> None:
         cv2.copyTo(variance, better.view(np.uint8), spread[here])
 
 
-def _planes(value: Float64, weight: Float64, radius: int, factor: float) -> _Planes:
+def _planes(
+    value: Float64, weight: Float64, radius: int, factor: float, moments: Float64
+) -> _Planes:
     """The planes fitted to the windows around all pixels.
 
     Args:
         factor: by how much they are known worse than from independent measurements.
+        moments: (10, H, W), to work in.
     """
     sums = _sums_by_kernels if radius < _WIDE else _sums_by_steps
     weighted = weight * value
     powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    moments = [
-        *sums(weight, radius, powers),
-        *sums(weighted, radius, powers[:3]),
-        *sums(weighted * value, radius, powers[:1]),
-    ]
+    sums(weight, radius, powers, moments[:6])
+    sums(weighted, radius, powers[:3], moments[6:9])
+    sums(weighted * value, radius, powers[:1], moments[9:])
     size = (2 * radius + 1, 2 * radius + 1)
     used = (weight > 0).astype(np.float32)
     count = cv2.boxFilter(used, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
@@ -219,38 +222,35 @@ def _planes(value: Float64, weight: Float64, radius: int, factor: float) -> _Pla
     return planes
 
 
-def _sums_by_kernels(image: Float64, radius: int, powers: Powers) -> list[Float64]:
+def _sums_by_kernels(image: Float64, radius: int, powers: Powers, sums: Float64) -> None:
     """Sums of the image times xᵃyᵇ over the windows around all pixels, x and y counted from
     there."""
     ramp = np.arange(-radius, radius + 1, dtype=np.float64)
     kernels = [ramp**power for power in range(3)]
-    return [
-        np.asarray(
-            cv2.sepFilter2D(image, -1, kernels[a], kernels[b], borderType=cv2.BORDER_CONSTANT)
+    for (a, b), total in zip(powers, sums, strict=True):
+        cv2.sepFilter2D(
+            image, -1, kernels[a], kernels[b], dst=total, borderType=cv2.BORDER_CONSTANT
         )
-        for a, b in powers
-    ]
 
 
-def _sums_by_steps(image: Float64, radius: int, powers: Powers) -> list[Float64]:
+def _sums_by_steps(image: Float64, radius: int, powers: Powers, sums: Float64) -> None:
     """The same in a time that does not grow with the radius: from window to window it is what
     enters that is added, and what leaves that is taken away."""
     height, width = image.shape
     size = (2 * radius + 1, 2 * radius + 1)
     x = np.arange(width, dtype=np.float64) - width // 2
     y = np.arange(height, dtype=np.float64)[:, np.newaxis] - height // 2
-    products, sums = {(0, 0): image}, dict[tuple[int, int], Float64]()
-    for a, b in powers:
+    products = {(0, 0): image}
+    for (a, b), total in zip(powers, sums, strict=True):
         if a:
             products[a, b] = products[a - 1, b] * x
         elif b:
             products[a, b] = products[a, b - 1] * y
-        sums[a, b] = np.asarray(
-            cv2.boxFilter(products[a, b], -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        )
+        border = cv2.BORDER_CONSTANT
+        cv2.boxFilter(products[a, b], -1, size, dst=total, normalize=False, borderType=border)
     # From about the picture's middle to about each window's, the highest powers first.
     for rows in bands(image.shape, _ARRAYS):
-        part = {power: total[rows] for power, total in sums.items()}
+        part = {power: total[rows] for power, total in zip(powers, sums, strict=True)}
         down = y[rows]
         for a, b in reversed(powers):
             if (a, b) == (1, 1):
@@ -264,7 +264,6 @@ def _sums_by_steps(image: Float64, radius: int, powers: Powers) -> list[Float64]
                 part[a, b] -= down * part[a, b - 1]
                 if b == 2:
                     part[a, b] -= down * (part[0, 1] - down * part[0, 0])
-    return [sums[power] for power in powers]
 
 
 def _solve(

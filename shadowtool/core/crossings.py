@@ -27,10 +27,10 @@ LEAST_CONTRAST = 2 * (1 - float(_NEARLY_LIT))
 # half, 0.00006.
 _NEARLY_LIT_KEYS = np.int16(41)
 # How many frames are in hand, those that wait to be looked at together among them.
-_BYTES, _LEAST, _MOST = 2**28, 8, 32
-_WAITING = 1 / 4
+_BYTES, _LEAST, _MOST = 2**28, 8, 48
+_WAITING = 1 / 3
 # Pixels that are looked at together, so that all that is known of them is in the cache.
-_BLOCK = 1 << 18
+_BLOCK = 1 << 17
 # The key of NaN, beyond all others; and one below all others.
 _UNKNOWN, _LOWEST = np.int16(0x7E00), np.int16(-0x8000)
 _INFINITE = 0x7C00
@@ -104,9 +104,9 @@ class CrossingFinder:
 
     def __init__(self, in_hand: int | None = None, together: int | None = None) -> None:
         """Args:
-        in_hand: how many frames are kept, three or more; an edge may take about twice as many to
-            pass. None for as many as are no burden to memory.
-        together: how many of them are looked at at a time; None for a quarter.
+        in_hand: how many frames are kept, three or more; an edge may take one and a half times as
+            many to pass. None for as many as are no burden to memory.
+        together: how many of them are looked at at a time; None for a third of them.
         """
         self._in_hand, self._together = in_hand, together
         self._waiting: list[Int16] = []

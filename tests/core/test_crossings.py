@@ -1,6 +1,7 @@
 """The crossing of the half-way threshold is the one that a second reading would find."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -64,3 +65,17 @@ def test_one_reading_finds_what_two_find(
     assert np.array_equal(found.before[told], before[told])
     assert np.array_equal(found.after[told], after[told])
     assert (found.at[found.lost] == 0).all()
+
+
+@pytest.mark.parametrize("frames", [20, 50])
+def test_edges_that_pass_slowly_are_followed_among_the_frames_in_hand(frames: int) -> None:
+    rng = np.random.default_rng(0)
+    arrival = rng.uniform(frames / 2, 100, (30, 40))
+    finder = CrossingFinder()
+    for number in range(100 + frames):
+        lit = 1 - np.clip((number - arrival) / frames + 0.5, 0, 1)
+        finder.add(0.15 + 0.85 * lit + rng.normal(scale=0.01, size=lit.shape))
+    found = finder.found()
+    known = found.at > 0
+    assert known.mean() > 0.8 and (known | found.lost).all()
+    assert np.median(np.abs(found.at - 0.5 - arrival)[known]) < 1

@@ -79,7 +79,7 @@ def luminance(image: NDArray[np.floating]) -> Float32:
     """(H, W, 3) linear RGB to (H, W) float32; not finite where a channel isn't."""
     gray = np.empty(image.shape[:2], np.float32)
     for rows in bands(image.shape):
-        gray[rows] = cv2.transform(to_float(image[rows]), LUMA[np.newaxis])
+        gray[rows] = _gray(image[rows])
     return gray
 
 
@@ -87,8 +87,12 @@ def luminance_halfs(image: NDArray[np.floating]) -> NDArray[np.float16]:
     """`luminance`, rounded to halfs; infinite where it is too large for one."""
     gray = np.empty(image.shape[:2], np.float16)
     for rows in bands(image.shape):
-        gray[rows] = rounded(luminance(image[rows]))
+        gray[rows] = rounded(_gray(image[rows]))
     return gray
+
+
+def _gray(image: NDArray[np.floating]) -> Float32:
+    return np.asarray(cv2.transform(to_float(image), LUMA[np.newaxis]), np.float32)
 
 
 def significant(crossings: Crossings, noise: NoiseModel) -> Crossings:

@@ -279,26 +279,38 @@ def _solve(
     w += 1e-9
     wxx += _LEVEL
     wyy += _LEVEL
-    # The inverse of the symmetric matrix of the normal equations, by cofactors.
-    caa, cab, cac = wxx * wyy - wxy * wxy, wy * wxy - wx * wyy, wx * wxy - wxx * wy
-    cbb, cbc, ccc = w * wyy - wy * wy, wx * wy - w * wxy, w * wxx - wx * wx
-    inverse = 1 / (w * caa + wx * cab + wy * cac)
-    for cofactor in (caa, cab, cac, cbb, cbc, ccc):
-        cofactor *= inverse
-    a = caa * wv + cab * wvx + cac * wvy
-    b = cab * wv + cbb * wvx + cbc * wvy
-    c = cac * wv + cbc * wvx + ccc * wvy
-    wvv -= a * wv + b * wvx + c * wvy
-    misfit = np.maximum(wvv, 0, out=wvv)
+    # About the weighted mean, where slopes and level are told apart.
+    inverse = 1 / w
+    mean_x, mean_y, mean_v = wx * inverse, wy * inverse, wv * inverse
+    wxx -= wx * mean_x
+    wxy -= wx * mean_y
+    wyy -= wy * mean_y
+    wvx -= mean_x * wv
+    wvy -= mean_y * wv
+    wvv -= mean_v * wv
+    determinant = wxx * wyy - wxy * wxy
+    slopes = wyy / determinant, -wxy / determinant, wxx / determinant
+    # From here on nothing large cancels out.
+    x, y, caa, cbb, cbc, ccc, vx, vy, misfit = (
+        part.astype(np.float32) for part in (mean_x, mean_y, inverse, *slopes, wvx, wvy, wvv)
+    )
+    b = cbb * vx + cbc * vy
+    c = cbc * vx + ccc * vy
+    planes.a[rows] = mean_v
+    planes.a[rows] -= b * x + c * y
+    np.multiply(b, radius, out=planes.b[rows])
+    np.multiply(c, radius, out=planes.c[rows])
+    misfit -= b * vx + c * vy
     misfit /= np.maximum(count - 3, 1)
-    worse = np.maximum(misfit, 1) * factor**2
-    planes.a[rows] = a
-    planes.b[rows] = b * radius
-    planes.c[rows] = c * radius
-    covariance = ((caa, 1), (cab, 2), (cac, 2), (cbb, 1), (cbc, 2), (ccc, 1))
-    powers = (0, 1, 1, 2, 2, 2)
-    for part, (element, times), power in zip(planes[3:], covariance, powers, strict=True):
-        np.multiply(element * worse, times * radius**power, out=part[rows], casting="same_kind")
+    cab, cac = cbb * x + cbc * y, cbc * x + ccc * y
+    caa += cab * x + cac * y
+    worse = np.maximum(misfit, 1)
+    worse *= factor**2
+    elements: tuple[Float32, ...] = (caa, cab, cac, cbb, cbc, ccc)
+    factors = (1, -2 * radius, -2 * radius, radius**2, 2 * radius**2, radius**2)
+    for part, element, times in zip(planes[3:], elements, factors, strict=True):
+        np.multiply(element, worse, out=part[rows])
+        part[rows] *= times
     planes.aa[rows] += np.float32(_FLOOR**2)
     planes.aa[rows][(misfit >= _MISFIT) | (count < 4)] = np.inf
 

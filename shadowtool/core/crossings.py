@@ -26,9 +26,10 @@ LEAST_CONTRAST = 2 * (1 - float(_NEARLY_LIT))
 # What loses the rest up to 1 loses at least so many keys, if it is no less than the least normal
 # half, 0.00006.
 _NEARLY_LIT_KEYS = np.int16(41)
-# How many frames are in hand, those that wait to be looked at together among them.
-_BYTES, _LEAST, _MOST = 2**28, 8, 48
-_WAITING = 1 / 3
+# How many frames are in hand, those that wait to be looked at together among them. Times of edges
+# that take longer than about forty frames are not worth having.
+_BYTES, _LEAST, _MOST = 2**28, 8, 27
+_WAITING = 1 / 4
 # Pixels that are looked at together, so that all that is known of them is in the cache.
 _BLOCK = 1 << 17
 # The key of NaN, beyond all others; and one below all others.
@@ -105,8 +106,8 @@ class CrossingFinder:
     def __init__(self, in_hand: int | None = None, together: int | None = None) -> None:
         """Args:
         in_hand: how many frames are kept, three or more; an edge may take one and a half times as
-            many to pass. None for as many as are no burden to memory.
-        together: how many of them are looked at at a time; None for a third of them.
+            many to pass. None for as many as are no burden to memory, and 27 at most.
+        together: how many of them are looked at at a time; None for a quarter.
         """
         self._in_hand, self._together = in_hand, together
         self._waiting: list[Int16] = []
@@ -229,8 +230,13 @@ class CrossingFinder:
         pixels, threshold, nearly_lit = pixels[crossed], threshold[crossed], nearly_lit[crossed]
         fresh = state.low[pixels] >= np.minimum(threshold, nearly_lit)
         begun, old = pixels[fresh], pixels[~fresh]
-        state.lost[begun] = False
         number = self._frames - len(new)
+        # Darker by noise long before, and an edge that takes several frames to pass: where it
+        # begins can't be told.
+        noisy = state.low[begun] < nearly_lit[fresh]
+        noisy &= number - state.at[begun] > len(seen) - 1
+        state.lost[begun] = False
+        state.lost[begun[noisy]] = _creeps_in(state, high, begun[noisy], new)
         # As if they had crossed in the frame before.
         last = np.full(len(begun), number - 1), seen[-1][begun], state.lower[begun]
         _search(state, begun, threshold[fresh], last, [*seen[-2:], *new], number - 2)
@@ -241,6 +247,23 @@ class CrossingFinder:
         state.lost[old] |= last[0] < number + 1
         _search(state, old, threshold[~fresh], last, [*seen, *new], number)
         state.lower[:], state.low[:] = lower, low
+
+
+def _creeps_in(state: _State, high: Int16, pixels: Indices, frames: Sequence[Int16]) -> Bool:
+    """Whether the threshold sinks below the crossing found last only when the pixel is darker than
+    that already: by a fall of many small steps."""
+    low, lit, after = state.low[pixels], high[pixels], state.after[pixels]
+    creeps, passed = np.zeros(len(pixels), bool), np.zeros(len(pixels), bool)
+    for frame in frames:
+        values = frame[pixels]
+        threshold = _midway(values, lit)
+        darker = values < low
+        falls = darker & (low >= threshold)
+        slips = darker & ~falls & ~passed & (after >= threshold)
+        creeps = (creeps | slips) & ~falls
+        passed |= falls | slips
+        np.minimum(low, values, out=low)
+    return creeps
 
 
 def _search(

@@ -67,15 +67,26 @@ def test_one_reading_finds_what_two_find(
     assert (found.at[found.lost] == 0).all()
 
 
-@pytest.mark.parametrize("frames", [20, 50])
+@pytest.mark.parametrize("frames", [20, 40])
 def test_edges_that_pass_slowly_are_followed_among_the_frames_in_hand(frames: int) -> None:
     rng = np.random.default_rng(0)
     arrival = rng.uniform(frames / 2, 100, (30, 40))
     finder = CrossingFinder()
     for number in range(100 + frames):
         lit = 1 - np.clip((number - arrival) / frames + 0.5, 0, 1)
-        finder.add(0.15 + 0.85 * lit + rng.normal(scale=0.01, size=lit.shape))
+        finder.add(0.15 + 0.85 * lit + rng.normal(scale=0.003, size=lit.shape))
     found = finder.found()
     known = found.at > 0
     assert known.mean() > 0.8 and (known | found.lost).all()
     assert np.median(np.abs(found.at - 0.5 - arrival)[known]) < 1
+
+
+def test_what_noise_darkened_before_an_edge_creeps_in_is_lost() -> None:
+    dark = np.concatenate([np.full(50, 1.0), np.linspace(1, 0.1, 37), np.full(9, 0.1)])
+    lost = {}
+    for dip in (1.0, 0.955):
+        finder = CrossingFinder(27)
+        for number, gray in enumerate(dark):
+            finder.add(np.full((1, 1), dip if number == 3 else gray))
+        lost[dip] = bool(finder.found().lost.all())
+    assert lost == {1.0: False, 0.955: True}

@@ -62,23 +62,24 @@ def _agreed(ratios: Float32) -> float | None:
 
 def _closed_in(ratios: Float32, centre: float, spread: float = 0.0) -> float:
     """The middle of those near the centre; no nearer than they scatter."""
-    ascending = np.sort(ratios)
+    ordered = np.sort(ratios)
     for width in _NEAR:
-        members = ascending[np.abs(ascending - centre) < max(width, spread)]
+        reach = max(width, spread)
+        first, last = np.searchsorted(ordered, (centre - reach, centre + reach))
         # Their median, as they are in order.
-        middle = members[(members.size - 1) // 2 : members.size // 2 + 1]
-        centre = float(middle.mean()) if middle.size else centre
+        middle = ordered[(first + last - 1) // 2 : (first + last) // 2 + 1]
+        centre = float(middle.mean()) if last > first else centre
     return centre
 
 
-def sampled_areas(gray: Float32) -> Float32:
+def sampled_areas(gray: NDArray[np.floating]) -> Float32:
     """Means of runs of pixels in evenly spaced rows, (H, W) to (h, w); what is left over at the
     right is left out."""
     step = max(1, round(max(gray.shape) / _AREAS))
     width = gray.shape[1] // step
     if width == 0:
-        return gray[::step, :1].copy()
-    runs = gray[::step, : width * step].reshape(-1, width, step)
+        return np.array(gray[::step, :1], np.float32)
+    runs = to_float(gray[::step, : width * step]).reshape(-1, width, step)
     return np.asarray(np.einsum("ijk->ij", runs) / np.float32(step), np.float32)
 
 

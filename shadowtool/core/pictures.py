@@ -1,9 +1,13 @@
 """Pictures to judge a scan and a warp map by, on set and in reports."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
+from shadowtool.core.half_floats import rounded, to_float
 from shadowtool.core.shadow_lines import ShadowLines
 from shadowtool.core.transfer import encode_srgb
 from shadowtool.core.warp_map import WarpMap, identity_map
@@ -16,8 +20,23 @@ _GREEN, _RED, _BLUE = (60, 230, 90), (255, 70, 50), (90, 150, 255)
 _SHIFT = 4
 
 
+def display(image: NDArray[np.floating]) -> UInt8:
+    """Linear light of any shape as sRGB-encoded code values; NaN is black."""
+    codes = np.ascontiguousarray(rounded(image)).view(np.uint16)
+    rows = codes.reshape(len(codes), -1)
+    return np.asarray(cv2.LUT(rows, _codes_of_halfs()), np.uint8).reshape(image.shape)
+
+
+@cache
+def _codes_of_halfs() -> UInt8:
+    """The code value of each half, by its bits."""
+    halfs = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
+    linear = np.clip(np.nan_to_num(to_float(halfs)), 0, 1)
+    return np.rint(encode_srgb(linear) * 255).astype(np.uint8)
+
+
 def time_picture(
-    image: NDArray[np.floating],
+    image: UInt8,
     time: Float32,
     lines: ShadowLines,
     plane: NDArray[np.bool_] | None = None,
@@ -26,7 +45,7 @@ def time_picture(
     """Shadow times as coloured bands over a frame, with fitted lines and the plane's outline.
 
     Args:
-        image: (H, W, 3) linear light.
+        image: (H, W, 3) from `display`.
         time: (H, W), NaN unknown.
         lines: fitted lines are drawn green, replaced ones red.
         plane: (H, W), outlined in blue.
@@ -35,16 +54,17 @@ def time_picture(
     Returns:
         (H, W, 3) uint8 RGB, sRGB-encoded.
     """
-    canvas = _dimmed(image)
-    known = np.isfinite(time)
-    if known.any():
-        low, high = float(np.min(time[known])), float(np.max(time[known]))
-        scaled = (np.nan_to_num(time, nan=low) - low) / max(high - low, 1e-6)
-        colours = _colours(scaled)
-        # A saw-tooth every few frames makes isolines visible.
-        phase = np.nan_to_num(np.mod(time, every), nan=0.0) / every
-        strength = (known * (0.35 + 0.3 * phase)).astype(np.float32)[..., None]
-        canvas = (canvas * (1 - strength) + colours * strength).astype(np.uint8)
+    canvas = image.copy()
+    low, high = float(np.fmin.reduce(time, axis=None)), float(np.fmax.reduce(time, axis=None))
+    if np.isfinite(low):
+        for rows in bands(time.shape):
+            known = np.isfinite(time[rows])
+            clock = np.fmax(time[rows], np.float32(low))
+            colours = _colours((clock - low) / max(high - low, 1e-6))
+            # A saw-tooth every few frames makes isolines visible.
+            clock /= every
+            strength = (0.35 + 0.3 * (clock - np.floor(clock))) * known
+            canvas[rows] = cv2.blendLinear(canvas[rows], colours, 1 - strength, strength)
         _write(canvas, f"frame {low:.0f} (blue) to {high:.0f} (red)")
     if plane is not None:
         outline, _ = cv2.findContours(
@@ -71,7 +91,7 @@ def warp_picture(image: NDArray[np.floating], warp_map: WarpMap, step: int = 16)
         (H, 2W, 3) uint8 RGB, sRGB-encoded.
     """
     height, width = warp_map.error.shape
-    canvas = _dimmed(image)
+    canvas = display(image)
     measured = np.isfinite(warp_map.error)
     canvas[~measured] //= 2
     warp = np.nan_to_num(warp_map.warp, nan=-1e4)
@@ -83,7 +103,7 @@ def warp_picture(image: NDArray[np.floating], warp_map: WarpMap, step: int = 16)
     canvas[edge & measured] = _GREEN
     displacement = np.linalg.norm(warp - identity_map(height, width), axis=-1)
     top = max(float(np.percentile(displacement[measured], 99)), 1.0) if measured.any() else 1.0
-    parallax = _colours(np.clip(displacement / top, 0, 1)).astype(np.uint8)
+    parallax = _colours(displacement / top)
     parallax[~measured] //= 2
     _write(parallax, f"displacement 0 (blue) to {top:.0f} px (red); dark: filled in")
     return np.hstack([canvas, parallax])
@@ -97,15 +117,10 @@ def _write(canvas: UInt8, text: str) -> None:
     cv2.putText(canvas, text, (x, y), font, 0.4, (235, 235, 235), 1, cv2.LINE_AA)
 
 
-def _dimmed(image: NDArray[np.floating]) -> UInt8:
-    coded = np.clip(encode_srgb(np.nan_to_num(image.astype(np.float32))), 0, 1)
-    return np.rint(coded * 255).astype(np.uint8)
-
-
-def _colours(scaled: Float32) -> Float32:
+def _colours(scaled: NDArray[np.floating]) -> UInt8:
     code = np.rint(np.clip(scaled, 0, 1) * 255).astype(np.uint8)
     mapped = cv2.applyColorMap(code, cv2.COLORMAP_TURBO)
-    return mapped[..., ::-1].astype(np.float32)
+    return np.asarray(cv2.cvtColor(mapped, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _draw_line(

@@ -6,15 +6,20 @@ fitted to a window that holds it, but need not be centred on it: of all such win
 plane is known best, among those that the measurements agree with.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Powers = Sequence[tuple[int, int]]
 
 # Half the windows' widths, pixels, for edges that move up to so many pixels a frame; and the
 # largest for any.
@@ -31,6 +36,10 @@ _COMPANY, _NEAR = 3, 1.0
 _LEVEL = 0.1
 # No plane is known better than this.
 _FLOOR = 0.02
+# From this radius on, sums over windows are made from those over their neighbours.
+_WIDE = 8
+# So many arrays of pixels are worked on together.
+_ARRAYS = 6
 
 
 @dataclass(frozen=True)
@@ -65,123 +74,257 @@ class Windows:
 
 
 def fit_planes(
-    value: Float32, error: Float32, windows: Windows = Windows()
+    value: Float32, error: Float32, windows: Windows = Windows(), wanted: slice = slice(None)
 ) -> tuple[Float32, Float32]:
     """Each pixel's value on the best known plane that agrees with the measurements around it.
 
     Args:
         value: (H, W) float32; NaN unknown, which takes no part.
         error: (H, W) float32, standard deviation of each value, in its unit; infinite unknown.
+        wanted: rows; no others are worked out.
 
     Returns:
-        Value and predicted error, (H, W) float32 each; NaN and infinite where the value was
-        unknown. A lone measurement that no neighbour agrees with is replaced.
+        Value and predicted error, (H, W) float32 each, of the rows wanted; NaN and infinite where
+        the value was unknown. A lone measurement that no neighbour agrees with is replaced.
     """
     known = np.isfinite(value) & np.isfinite(error)
+    variance = np.where(known, error, 1).astype(np.float64) ** 2
+    trusted = known & _in_company(np.where(known, value, np.float32(np.nan)), variance)
     measured = np.where(known, value, 0).astype(np.float64)
-    variance = np.where(known, error.astype(np.float64) ** 2, np.inf)
-    trusted = known & _in_company(measured, variance)
     weight = np.where(trusted, 1 / np.maximum(variance, 1e-12), 0)
-    best = measured.astype(np.float32)
-    own = best.copy()
-    own_weight = weight.astype(np.float32)
+    first, last, _ = wanted.indices(len(value))
+    known, trusted, variance = known[wanted], trusted[wanted], variance[wanted]
+    best = measured[wanted].astype(np.float32)
     spread = np.where(trusted, variance, np.inf).astype(np.float32)
+    # A plane may deviate from the measurement by so much.
+    allowed = np.where(trusted, _AGREES * np.sqrt(variance), np.inf).astype(np.float32)
+    least, most = best - allowed, best + allowed
+    moments = np.empty((10, *value.shape))
     for radius in windows.radii:
-        plane, covariance, misfit = _planes(measured, weight, radius)
-        smaller, smaller_spread = best.copy(), spread.copy()
-        for row, column in np.ndindex(3, 3):
-            dy, dx = (row - 1) * radius, (column - 1) * radius
-            here, there = _overlap(value.shape, dy, dx)
-            # The window's centre lies (dx, dy) ahead, so the pixel lies (-dx, -dy) off it.
-            fitted = plane[0][there] - dx * plane[1][there] - dy * plane[2][there]
-            certain = _variance(covariance, there, -dx, -dy)
-            certain *= np.maximum(misfit[there], 1) * np.float32(windows.factor**2)
-            certain += _FLOOR**2
-            off_own = (fitted - own[here]) ** 2 * own_weight[here]
-            off_smaller = (fitted - smaller[here]) ** 2
-            better = (certain < spread[here]) & (misfit[there] < _MISFIT)
-            better &= (off_own < _AGREES**2) & (off_smaller <= _AGREES**2 * smaller_spread[here])
-            np.copyto(best[here], fitted, where=better)
-            np.copyto(spread[here], certain, where=better)
+        # A pixel's windows are centred up to a radius off it, and end at another.
+        start, stop = max(first - 2 * radius, 0), last + 2 * radius
+        own, heavy = measured[start:stop], weight[start:stop]
+        planes = _planes(own, heavy, radius, windows.factor, moments[:, : len(own)])
+        for rows in bands(best.shape, channels=_ARRAYS):
+            chosen = _Choice(*(part[rows] for part in (best, spread, least, most)))
+            _choose(planes, radius, rows.start + first - start, chosen)
     found = known & np.isfinite(spread)
-    fitted_error = np.where(found, np.sqrt(np.where(found, spread, 0)), np.inf)
-    return np.where(found, best, np.nan).astype(np.float32), fitted_error.astype(np.float32)
+    best[~found] = np.nan
+    spread[~found] = np.inf
+    return best, np.sqrt(spread, out=spread)
 
 
-def _in_company(value: Float64, variance: Float64) -> Bool:
-    """Where enough of the eight pixels around agree with a measurement."""
+def _in_company(value: Float32, variance: Float64) -> Bool:
+    """Where enough of the eight pixels around agree with a measurement; NaN agrees with none."""
     company = np.zeros(value.shape, np.uint8)
-    for row, column in np.ndindex(3, 3):
-        dy, dx = row - 1, column - 1
-        if dy == dx == 0:
-            continue
+    variance = variance.astype(np.float32)
+    # The other four directions are these from the other pixel's point of view.
+    for dy, dx in ((0, 1), (1, -1), (1, 0), (1, 1)):
         here, there = _overlap(value.shape, dy, dx)
-        allowed = _AGREES * np.sqrt(variance[here] + variance[there]) + _NEAR
-        agrees = np.isfinite(allowed) & (np.abs(value[here] - value[there]) < allowed)
+        allowed = np.sqrt(variance[here] + variance[there])
+        allowed *= np.float32(_AGREES)
+        allowed += np.float32(_NEAR)
+        agrees = np.abs(value[here] - value[there]) < allowed
         company[here] += agrees
+        company[there] += agrees
     return company >= _COMPANY
 
 
-def _planes(
-    value: Float64, weight: Float64, radius: int
-) -> tuple[list[Float32], list[Float32], Float32]:
-    """The plane a + bx + cy fitted to the window around each pixel, x and y counted from there.
+class _Planes(NamedTuple):
+    """The planes a + bx + cy fitted to the windows around the pixels, x and y counted from the
+    middle in radii; the variance at (x, y) is aa + x·ab + y·ac + x²·bb + xy·bc + y²·cc, infinite
+    where the window holds more than one surface. (H, W) float32 each."""
 
-    Returns:
-        (a, b, c); the six different elements of their covariance matrix, row by row; the mean
-        squared deviation in squared errors. (H, W) float32 each.
+    a: Float32
+    b: Float32
+    c: Float32
+    aa: Float32
+    ab: Float32
+    ac: Float32
+    bb: Float32
+    bc: Float32
+    cc: Float32
+
+    def at(self, pixels: tuple[slice, slice], x: int, y: int) -> tuple[Float32, Float32]:
+        """Value and variance at (x, y), each of which is -1, 0 or 1, of the windows at pixels."""
+        a, b, c, aa, ab, ac, bb, bc, cc = (part[pixels] for part in self)
+        value, variance = a.copy(), aa.copy()
+        for side, slope, linear, square in ((x, b, ab, bb), (y, c, ac, cc)):
+            if side:
+                _added(value, slope, side)
+                _added(variance, linear, side)
+                variance += square
+        if x and y:
+            _added(variance, bc, x * y)
+        return value, variance
+
+
+def _added(total: Float32, part: Float32, sign: int) -> None:
+    (np.add if sign > 0 else np.subtract)(total, part, out=total)
+
+
+class _Choice(NamedTuple):
+    """Value and variance of what was chosen so far, and between what a plane's value has to lie to
+    agree with the pixel's own; (H, W) float32 each."""
+
+    value: Float32
+    variance: Float32
+    least: Float32
+    most: Float32
+
+
+def _choose(planes: _Planes, radius: int, first: int, chosen: _Choice) -> None:
+    """Replace what was chosen by the best known of the windows that hold a pixel.
+
+    Args:
+        first: the row among the planes that is the first of the choice.
     """
-    ramp = np.arange(-radius, radius + 1, dtype=np.float64)
-    flat = np.ones_like(ramp)
+    best, spread, least, most = chosen
+    rows = slice(first, first + len(best))
+    # And with what smaller windows told.
+    allowed = np.sqrt(spread)
+    allowed *= np.float32(_AGREES)
+    least, most = np.maximum(least, best - allowed), np.minimum(most, best + allowed)
+    for row, column in np.ndindex(3, 3):
+        y, x = row - 1, column - 1
+        # The window's centre lies (x, y) ahead, so the pixel lies (-x, -y) off it.
+        here, there = _overlap(planes.a.shape, y * radius, x * radius, rows)
+        value, variance = planes.at(there, -x, -y)
+        better = variance < spread[here]
+        better &= value >= least[here]
+        better &= value <= most[here]
+        # Many times faster than numpy's own where it goes now one way, now the other.
+        cv2.copyTo(value, better.view(np.uint8), best[here])
+        cv2.copyTo(variance, better.view(np.uint8), spread[here])
 
-    def moment(image: Float64, across: Float64, down: Float64) -> Float64:
-        total = cv2.sepFilter2D(image, -1, across, down, borderType=cv2.BORDER_CONSTANT)
-        return np.asarray(total, np.float64)
 
+def _planes(
+    value: Float64, weight: Float64, radius: int, factor: float, moments: Float64
+) -> _Planes:
+    """The planes fitted to the windows around all pixels.
+
+    Args:
+        factor: by how much they are known worse than from independent measurements.
+        moments: (10, H, W), to work in.
+    """
+    sums = _sums_by_kernels if radius < _WIDE else _sums_by_steps
     weighted = weight * value
-    w, wx, wy = moment(weight, flat, flat), moment(weight, ramp, flat), moment(weight, flat, ramp)
-    wxx, wxy = moment(weight, ramp**2, flat) + _LEVEL, moment(weight, ramp, ramp)
-    wyy = moment(weight, flat, ramp**2) + _LEVEL
-    wv, wvx, wvy = (moment(weighted, *k) for k in ((flat, flat), (ramp, flat), (flat, ramp)))
-    wvv = moment(weighted * value, flat, flat)
-    count = moment((weight > 0).astype(np.float64), flat, flat)
+    powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    sums(weight, radius, powers, moments[:6])
+    sums(weighted, radius, powers[:3], moments[6:9])
+    sums(weighted * value, radius, powers[:1], moments[9:])
+    size = (2 * radius + 1, 2 * radius + 1)
+    used = (weight > 0).astype(np.float32)
+    count = cv2.boxFilter(used, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    planes = _Planes(*(np.empty(value.shape, np.float32) for _ in range(9)))
+    for rows in bands(value.shape, channels=_ARRAYS):
+        _solve([part[rows] for part in moments], count[rows], factor, radius, rows, planes)
+    return planes
+
+
+def _sums_by_kernels(image: Float64, radius: int, powers: Powers, sums: Float64) -> None:
+    """Sums of the image times xᵃyᵇ over the windows around all pixels, x and y counted from
+    there."""
+    ramp = np.arange(-radius, radius + 1, dtype=np.float64)
+    kernels = [ramp**power for power in range(3)]
+    for (a, b), total in zip(powers, sums, strict=True):
+        cv2.sepFilter2D(
+            image, -1, kernels[a], kernels[b], dst=total, borderType=cv2.BORDER_CONSTANT
+        )
+
+
+def _sums_by_steps(image: Float64, radius: int, powers: Powers, sums: Float64) -> None:
+    """The same in a time that does not grow with the radius: from window to window it is what
+    enters that is added, and what leaves that is taken away."""
+    height, width = image.shape
+    size = (2 * radius + 1, 2 * radius + 1)
+    x = np.arange(width, dtype=np.float64) - width // 2
+    y = np.arange(height, dtype=np.float64)[:, np.newaxis] - height // 2
+    products = {(0, 0): image}
+    for (a, b), total in zip(powers, sums, strict=True):
+        if a:
+            products[a, b] = products[a - 1, b] * x
+        elif b:
+            products[a, b] = products[a, b - 1] * y
+        border = cv2.BORDER_CONSTANT
+        cv2.boxFilter(products[a, b], -1, size, dst=total, normalize=False, borderType=border)
+    # From about the picture's middle to about each window's, the highest powers first.
+    for rows in bands(image.shape, _ARRAYS):
+        part = {power: total[rows] for power, total in zip(powers, sums, strict=True)}
+        down = y[rows]
+        for a, b in reversed(powers):
+            if (a, b) == (1, 1):
+                part[1, 1] -= down * part[1, 0]
+                part[1, 1] -= x * (part[0, 1] - down * part[0, 0])
+            elif a:
+                part[a, b] -= x * part[a - 1, b]
+                if a == 2:
+                    part[a, b] -= x * (part[1, 0] - x * part[0, 0])
+            elif b:
+                part[a, b] -= down * part[a, b - 1]
+                if b == 2:
+                    part[a, b] -= down * (part[0, 1] - down * part[0, 0])
+
+
+def _solve(
+    moments: list[Float64],
+    count: NDArray[Any],
+    factor: float,
+    radius: int,
+    rows: slice,
+    planes: _Planes,
+) -> None:
+    """The planes of some rows from the sums over their windows, which are overwritten."""
+    w, wx, wy, wxx, wxy, wyy, wv, wvx, wvy, wvv = moments
     w += 1e-9
-    # The inverse of the symmetric matrix of the normal equations, by cofactors.
-    caa, cab, cac = wxx * wyy - wxy * wxy, wy * wxy - wx * wyy, wx * wxy - wxx * wy
-    cbb, cbc, ccc = w * wyy - wy * wy, wx * wy - w * wxy, w * wxx - wx * wx
-    determinant = w * caa + wx * cab + wy * cac
-    for cofactor in (caa, cab, cac, cbb, cbc, ccc):
-        cofactor /= determinant
-    a = caa * wv + cab * wvx + cac * wvy
-    b = cab * wv + cbb * wvx + cbc * wvy
-    c = cac * wv + cbc * wvx + ccc * wvy
-    misfit = np.maximum(wvv - (a * wv + b * wvx + c * wvy), 0) / np.maximum(count - 3, 1)
-    misfit[count < 4] = np.inf
-    plane = [part.astype(np.float32) for part in (a, b, c)]
-    covariance = [part.astype(np.float32) for part in (caa, cab, cac, cbb, cbc, ccc)]
-    return plane, covariance, misfit.astype(np.float32)
-
-
-def _variance(
-    covariance: list[Float32], where: tuple[slice, slice], x: int, y: int
-) -> NDArray[np.float32]:
-    """Of the plane's value at (x, y) from the window's centre."""
-    caa, cab, cac, cbb, cbc, ccc = (part[where] for part in covariance)
-    total = caa + 2 * x * cab
-    total += 2 * y * cac
-    total += x * x * cbb
-    total += 2 * x * y * cbc
-    total += y * y * ccc
-    return np.asarray(np.maximum(total, 0, out=total), np.float32)
+    wxx += _LEVEL
+    wyy += _LEVEL
+    # About the weighted mean, where slopes and level are told apart.
+    inverse = 1 / w
+    mean_x, mean_y, mean_v = wx * inverse, wy * inverse, wv * inverse
+    wxx -= wx * mean_x
+    wxy -= wx * mean_y
+    wyy -= wy * mean_y
+    wvx -= mean_x * wv
+    wvy -= mean_y * wv
+    wvv -= mean_v * wv
+    determinant = wxx * wyy - wxy * wxy
+    slopes = wyy / determinant, -wxy / determinant, wxx / determinant
+    # From here on nothing large cancels out.
+    x, y, caa, cbb, cbc, ccc, vx, vy, misfit = (
+        part.astype(np.float32) for part in (mean_x, mean_y, inverse, *slopes, wvx, wvy, wvv)
+    )
+    b = cbb * vx + cbc * vy
+    c = cbc * vx + ccc * vy
+    planes.a[rows] = mean_v
+    planes.a[rows] -= b * x + c * y
+    np.multiply(b, radius, out=planes.b[rows])
+    np.multiply(c, radius, out=planes.c[rows])
+    misfit -= b * vx + c * vy
+    misfit /= np.maximum(count - 3, 1)
+    cab, cac = cbb * x + cbc * y, cbc * x + ccc * y
+    caa += cab * x + cac * y
+    worse = np.maximum(misfit, 1)
+    worse *= factor**2
+    elements: tuple[Float32, ...] = (caa, cab, cac, cbb, cbc, ccc)
+    factors = (1, -2 * radius, -2 * radius, radius**2, 2 * radius**2, radius**2)
+    for part, element, times in zip(planes[3:], elements, factors, strict=True):
+        np.multiply(element, worse, out=part[rows])
+        part[rows] *= times
+    planes.aa[rows] += np.float32(_FLOOR**2)
+    planes.aa[rows][(misfit >= _MISFIT) | (count < 4)] = np.inf
 
 
 def _overlap(
-    shape: tuple[int, ...], dy: int, dx: int
+    shape: tuple[int, ...], dy: int, dx: int, rows: slice = slice(None)
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """The pixels that have another one (dy, dx) ahead within the picture, and those others."""
+    """The pixels of these rows that have another one (dy, dx) ahead within the picture, counted
+    from the first of the rows, and those others."""
     height, width = shape
-    here = (slice(max(-dy, 0), height - max(dy, 0)), slice(max(-dx, 0), width - max(dx, 0)))
-    there = (slice(max(dy, 0), height - max(-dy, 0)), slice(max(dx, 0), width - max(-dx, 0)))
-    if height <= abs(dy) or width <= abs(dx):
+    first, last, _ = rows.indices(height)
+    start, stop = max(first, -dy), min(last, height - dy)
+    left, right = max(0, -dx), min(width, width - dx)
+    if start >= stop or left >= right:
         return (slice(0, 0), slice(0, 0)), (slice(0, 0), slice(0, 0))
-    return here, there
+    here = (slice(start - first, stop - first), slice(left, right))
+    return here, (slice(start + dy, stop + dy), slice(left + dx, right + dx))

@@ -5,12 +5,16 @@ and y down. The normals of a pass all point to one side, so that neighbouring li
 interpolated; the paper's x = m·y + b fails for lines near horizontal.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
+
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Origin = Literal["fit", "refit", "interpolated"]
 
@@ -20,8 +24,9 @@ _LARGEST_STEP = 8
 _LEAST_POINTS = 12
 # Root mean square distance of the points from their middle, along the line, pixels.
 _LEAST_SPREAD = 4.0
-# A fit tries this many lines through two points, and keeps the points this near, pixels.
-_HYPOTHESES, _NEAR = 200, 2.0
+# A fit tries this many lines through two points, judges them by about so many points, and keeps the
+# points this near, pixels.
+_HYPOTHESES, _JUDGES, _NEAR = 200, 500, 2.0
 # A line is poor if its residual is this many times the pass's median, and larger than the floor.
 _POOR_RATIO, _POOR_FLOOR = 2.5, 0.5
 # A direction jumps if it is this many times the pass's median deviation off its neighbours'
@@ -221,30 +226,22 @@ def zero_crossings(
         By index into ``frames``: (P, 2) float64 points (x, y), interpolated between the pixels'
         centres. Frames without a point are left out.
     """
-    clock = _frame_index(time.astype(np.float64), frames)
-    clock[~plane] = np.nan
-    indices, points = [], []
-    for axis in (0, 1):
-        a, b = (clock[:-1], clock[1:]) if axis == 0 else (clock[:, :-1], clock[:, 1:])
-        with np.errstate(invalid="ignore"):
-            low, high = np.minimum(a, b), np.maximum(a, b)
-            usable = (high > low) & (high - low <= _LARGEST_STEP)
-        y, x = np.nonzero(usable)
-        start, end = a[y, x], b[y, x]
-        nearest = np.ceil(low[y, x])
-        # A frame exactly at the lower of two times belongs to the pair on its other side.
-        nearest += nearest == low[y, x]
-        top = high[y, x]
-        for step in range(_LARGEST_STEP + 1):
-            crossed = nearest + step <= top
-            if not crossed.any():
-                break
-            index = nearest[crossed] + step
-            part = (index - start[crossed]) / (end[crossed] - start[crossed])
-            point = np.stack([x[crossed], y[crossed]], axis=-1).astype(np.float64)
-            point[:, 1 - axis] += part
-            indices.append(index.astype(np.int64))
-            points.append(point)
+    indices, points = list[NDArray[np.int64]](), list[Float64]()
+    for rows in bands(time.shape):
+        # With the first row of the next band.
+        band = slice(rows.start, rows.stop + 1)
+        clock = np.where(plane[band], _frame_index(time[band], frames), np.float32(np.nan))
+        whole = np.floor(clock)
+        for axis, own in ((0, slice(None)), (1, slice(rows.stop - rows.start))):
+            (a, b), (low, high) = (_neighbours(part[own], axis) for part in (clock, whole))
+            steps = np.abs(high - low)
+            y, x = np.nonzero((steps > 0) & (steps <= _LARGEST_STEP + 1))
+            found = _between(a[y, x].astype(np.float64), b[y, x].astype(np.float64))
+            for pair, index, part in found:
+                point = np.stack([x[pair], y[pair] + rows.start], axis=-1).astype(np.float64)
+                point[:, 1 - axis] += part
+                indices.append(index)
+                points.append(point)
     if not indices:
         return {}
     index, point = np.concatenate(indices), np.concatenate(points)
@@ -258,11 +255,37 @@ def zero_crossings(
     }
 
 
-def _frame_index(time: Float64, frames: Float64) -> Float64:
+def _neighbours(image: Float32, axis: int) -> tuple[Float32, Float32]:
+    """Each pixel but the last ones along the axis, and the one after it."""
+    return (image[:-1], image[1:]) if axis == 0 else (image[:, :-1], image[:, 1:])
+
+
+def _between(
+    start: Float64, end: Float64
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.int64], Float64]]:
+    """Whole numbers between two ends: the pairs that have one, the number, and where it lies from
+    start (0) to end (1)."""
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    nearest = np.ceil(low)
+    # A frame exactly at the lower of two times belongs to the pair on its other side.
+    nearest += nearest == low
+    near = high - low <= _LARGEST_STEP
+    for step in range(_LARGEST_STEP + 1):
+        pairs = np.flatnonzero(near & (nearest + step <= high))
+        if not pairs.size:
+            break
+        index = nearest[pairs] + step
+        part = (index - start[pairs]) / (end[pairs] - start[pairs])
+        yield pairs, index.astype(np.int64), part
+
+
+def _frame_index(time: Float32, frames: Float64) -> Float32:
     """Frame numbers to positions in the list of frames, NaN kept."""
+    if (np.diff(frames) == 1).all():
+        return time - np.float32(frames[0])
     clock = np.interp(time, frames, np.arange(len(frames), dtype=np.float64))
     clock[np.isnan(time)] = np.nan
-    return clock
+    return clock.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -284,10 +307,13 @@ def _fit(points: Float64) -> _Line | None:
     if usable.any():
         one, along, length = one[usable], along[usable], length[usable]
         normal = np.stack([-along[:, 1], along[:, 0]], axis=-1) / length[:, None]
-        distance = np.abs(points @ normal.T - (one * normal).sum(axis=-1))
+        offset = -(one * normal).sum(axis=-1)
+        judges = points[:: max(1, len(points) // _JUDGES)]
+        distance = judges @ normal.T + offset
         # Not a count with a sharp bound but how near the near ones are.
         score = np.maximum(1 - (distance / _NEAR) ** 2, 0).sum(axis=0)
-        points = points[distance[:, int(np.argmax(score))] <= _NEAR]
+        best = int(np.argmax(score))
+        points = points[np.abs(points @ normal[best] + offset[best]) <= _NEAR]
     if len(points) < _LEAST_POINTS:
         return None
     middle = points.mean(axis=0)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.half_floats import to_float, to_half
+from shadowtool.core.half_floats import rounded, to_float, to_half
 from shadowtool.core.plates import Plates
 from shadowtool.core.shadow_lines import ShadowLines
 from shadowtool.core.shadow_time import ShadowTimes
@@ -113,8 +113,14 @@ def plate_layers(
 
 
 def write_scan(folder: Path, scan: Pass, header: Header, provenance: Provenance) -> None:
-    """Write ``scan.exr`` and ``lines.json``."""
+    """Write ``scan.exr`` and ``lines.json``.
+
+    Of errors and contrast a half keeps all digits that say something; contrast stays a single
+    float, as other programs expect it.
+    """
     layers = {part.name: getattr(scan.times, part.name) for part in fields(scan.times)}
+    layers |= {name: rounded(layers[name]) for name in ("error", "own_error")}
+    layers["contrast"] = to_float(rounded(scan.times.contrast))
     write_exr(folder / SCAN, layers, header, provenance)
     lines = scan.lines
     rows = [

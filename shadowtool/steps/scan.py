@@ -3,15 +3,18 @@
 import logging
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Gain
 from shadowtool.core.bands import overlapping_bands
+from shadowtool.core.crossings import CrossingFinder, Crossings
 from shadowtool.core.exposure import RunningGain, sampled_areas
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
-from shadowtool.core.pictures import time_picture
+from shadowtool.core.pictures import display, time_picture
 from shadowtool.core.shadow_lines import (
     Bend,
     NoLinesError,
@@ -23,10 +26,8 @@ from shadowtool.core.shadow_lines import (
 )
 from shadowtool.core.shadow_time import (
     SHADE,
-    CrossingFinder,
-    Crossings,
     ShadowTimes,
-    luminance,
+    luminance_halfs,
     own_times,
     refined_times,
     significant,
@@ -54,7 +55,9 @@ from shadowtool.steps.run import (
 
 logger = logging.getLogger(__name__)
 
+Float16 = NDArray[np.float16]
 Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
 PICTURE = "scan.png"
 
 # Bends of more pixels than this, that are so many standard deviations, come from a lens.
@@ -102,7 +105,7 @@ def scan(
         figures = unchanged(output, products, mark)
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
-    crossings, noise, marks, gains = _crossings(footage, frames, gain, run)
+    crossings, noise, marks, gains, first = _crossings(footage, frames, gain, run)
     used = list(gains)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
     numbers = np.array([float(frame) for frame in used])
@@ -126,21 +129,51 @@ def scan(
     mark = recipe.fingerprint([plane_mark, *marks])
     provenance = recipe.provenance(mark)
     make_folder(output)
-    write_scan(output, Pass(times, lines), footage.header, provenance)
-    picture = time_picture(footage.read(used[0]), times.time, lines, region)
-    write_png(output / PICTURE, picture, provenance)
+
+    def draw() -> None:
+        picture = display(footage.read(used[0])) if first is None else first
+        picture = time_picture(picture, times.time, lines, region)
+        write_png(output / PICTURE, picture, provenance)
+
+    def write() -> None:
+        write_scan(output, Pass(times, lines), footage.header, provenance)
+
+    for _ in ordered_map(lambda make: make(), (write, draw), run.jobs):
+        pass
     write_manifest(output, recipe, mark, figures)
     return Result("scan", output, used, 0, skipped, figures)
 
 
-def _crossings(
-    footage: Footage, frames: list[Frame], gain: Gain, run: Run
-) -> tuple[Crossings, NoiseModel, list[str], dict[Frame, float]]:
-    """One reading of the pass: its crossings and noise, the content of its files, and the gains of
-    the frames that could be read."""
+class _Reading(NamedTuple):
+    """What one reading of the pass gives.
+
+    Attributes:
+        marks: the content of its files.
+        gains: of the frames that could be read.
+        first: the first frame, if it could be read, to be looked at.
+    """
+
+    crossings: Crossings
+    noise: NoiseModel
+    marks: list[str]
+    gains: dict[Frame, float]
+    first: UInt8 | None
+
+
+class _Seen(NamedTuple):
+    """What is taken from a frame."""
+
+    gray: Float16
+    areas: Float32
+    sample: Float32 | None
+    picture: UInt8 | None
+    mark: str
+
+
+def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _Reading:
     samples = sample_positions(len(frames))
 
-    def read(position: int) -> tuple[Float32, Float32, Float32 | None, str] | None:
+    def read(position: int) -> _Seen | None:
         try:
             image = footage.image(frames[position])
         except DamagedFileError:
@@ -149,18 +182,21 @@ def _crossings(
             raise
         values = image.rgb(footage.transfer)
         sample = thin(values) if position in samples.values() else None
-        gray = luminance(values)
-        return gray, sampled_areas(gray), sample, image.fingerprint
+        picture = display(values) if position == 0 else None
+        gray = luminance_halfs(values)
+        return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
 
     finder, exposure = CrossingFinder(), RunningGain()
     marks, gains = list[str](), dict[Frame, float]()
     thinned: dict[int, Float32] = {}
+    first: UInt8 | None = None
     run.progress(0, len(frames))
     for position, item in enumerate(ordered_map(read, range(len(frames)), run.jobs)):
         if item is not None:
-            gray, areas, sample, mark = item
+            gray, areas, sample, picture, mark = item
+            first = first if picture is None else picture
             own = exposure.add(areas) if gain == "auto" else 1.0
-            finder.add(gray if own == 1 else gray / np.float32(own))
+            finder.add(gray if own == 1 else to_float(gray) / np.float32(own))
             marks.append(mark)
             gains[frames[position]] = own
             if sample is not None:
@@ -170,7 +206,7 @@ def _crossings(
     if len(gains) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
     noise = noise_model(noise_levels(thinned))
-    return significant(finder.found(), noise), noise, marks, gains
+    return _Reading(significant(finder.found(), noise), noise, marks, gains, first)
 
 
 def _times(
@@ -183,34 +219,31 @@ def _times(
     """Times and errors, each pixel's own and as its neighbours tell them too."""
     own, own_error = own_times(crossings, noise)
     contrast = np.nan_to_num(crossings.highest - crossings.lowest)
-    loss = usual_loss(contrast, crossings.highest, np.isfinite(own), region)
-    lit = np.isfinite(own) & (loss >= SHADE)
-    own = np.where(lit, own, np.float32(np.nan))
-    own_error = np.where(lit, own_error / np.maximum(loss, SHADE) ** 2, np.float32(np.inf))
+    loss = usual_loss(contrast, crossings.highest, crossings.at > 0, region)
+    in_shade = loss < SHADE
+    own[in_shade], own_error[in_shade] = np.nan, np.inf
+    own_error /= np.maximum(loss, SHADE) ** 2
     time, error = np.empty_like(own), np.empty_like(own_error)
     windows = time_windows(own, region)
 
-    def refine(band: tuple[slice, slice]) -> tuple[slice, slice, tuple[Float32, Float32]]:
+    def refine(band: tuple[slice, slice]) -> None:
         rows, inner = band
-        found = refined_times(own[rows], own_error[rows], crossings.at[rows], windows)
-        return rows, inner, found
+        found = refined_times(own[rows], own_error[rows], crossings.at[rows], windows, inner)
+        time[rows][inner], error[rows][inner] = found
 
-    for rows, inner, found in ordered_map(refine, overlapping_bands(len(own), windows.reach), jobs):
-        for whole, part in zip((time, error), found, strict=True):
-            whole[rows][inner] = part[inner]
-    # From positions among the frames to frame numbers, which may be further apart.
-    spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))
-    return ShadowTimes(
-        _numbers(time, numbers),
-        (error * spacing).astype(np.float32),
-        contrast,
-        _numbers(own, numbers),
-        (own_error * spacing).astype(np.float32),
-    )
+    for _ in ordered_map(refine, overlapping_bands(len(own), windows.reach), jobs):
+        pass
+    if (np.diff(numbers) != 1).any():
+        # From positions among the frames to frame numbers, which are not one apart.
+        spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))
+        error, own_error = ((e * spacing).astype(np.float32) for e in (error, own_error))
+    return ShadowTimes(_numbers(time, numbers), error, contrast, _numbers(own, numbers), own_error)
 
 
 def _numbers(clock: Float32, numbers: NDArray[np.float64]) -> Float32:
     """Positions among the frames to frame numbers, NaN kept."""
+    if (np.diff(numbers) == 1).all():
+        return clock + np.float32(numbers[0])
     return np.interp(clock, np.arange(len(numbers)), numbers).astype(np.float32)
 
 

@@ -52,11 +52,10 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
         own = [scan.part(rows) for scan in passes]
         here = positions[rows]
         if epipole is None:
-            part = _in_two_dimensions(own, here, speeds, windows)
+            part = _in_two_dimensions(own, here, speeds, windows, inner)
         else:
-            part = _towards(epipole, own, here, speeds, windows)
-        own_rows = slice(rows.start + inner.start, rows.start + inner.stop)
-        return own_rows, WarpMap(part.warp[inner], part.error[inner])
+            part = _towards(epipole, own, here, speeds, windows, inner)
+        return slice(rows.start + inner.start, rows.start + inner.stop), part
 
     whole = WarpMap(np.empty((height, width, 2), np.float32), np.empty((height, width), np.float32))
     cuts = overlapping_bands(height, windows.reach)
@@ -73,11 +72,12 @@ def _towards(
     positions: Float32,
     speeds: list[NDArray[np.float64]],
     windows: Windows,
+    wanted: slice,
 ) -> WarpMap:
     directions = epipole.directions(positions)
     shift, error = measure_parallax(passes, positions, directions, speeds)
-    shift, error = fit_planes(shift, error, windows)
-    return WarpMap(positions + shift[..., None] * directions, error)
+    shift, error = fit_planes(shift, error, windows, wanted)
+    return WarpMap(positions[wanted] + shift[..., None] * directions[wanted], error)
 
 
 def _in_two_dimensions(
@@ -85,11 +85,12 @@ def _in_two_dimensions(
     positions: Float32,
     speeds: list[NDArray[np.float64]],
     windows: Windows,
+    wanted: slice,
 ) -> WarpMap:
     found = intersect(passes, speeds)
     displacement = found.warp - positions
     # The predicted error is that of both coordinates together.
     each = (found.error / np.sqrt(2)).astype(np.float32)
-    x, y = (fit_planes(displacement[..., axis], each, windows) for axis in (0, 1))
-    warp = positions + np.stack([x[0], y[0]], axis=-1)
+    x, y = (fit_planes(displacement[..., axis], each, windows, wanted) for axis in (0, 1))
+    warp = positions[wanted] + np.stack([x[0], y[0]], axis=-1)
     return WarpMap(warp, np.hypot(x[1], y[1]).astype(np.float32))

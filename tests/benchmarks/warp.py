@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from shadowtool.core.crossings import CrossingFinder
 from shadowtool.core.diffusion import diffuse
 from shadowtool.core.shadow_lines import fit_shadow_lines, line_speed, zero_crossings
 from shadowtool.core.shadow_time import (
-    CrossingFinder,
     ShadowTimes,
     interpolated_times,
     luminance,

@@ -5,6 +5,8 @@ import pytest
 from hypothesis import strategies as st
 
 from shadowtool.core import color_line, diffusion, pictures, shadow_time, warp_map
+from shadowtool.core.crossings import CrossingFinder, Crossings
+from shadowtool.core.half_floats import rounded
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines, line_speed
 from shadowtool.core.warp_map import WarpMap
@@ -42,8 +44,8 @@ def stays_within(result, values) -> bool:
     )
 
 
-def crossed(*grays) -> shadow_time.Crossings:
-    finder = shadow_time.CrossingFinder()
+def crossed(*grays) -> Crossings:
+    finder = CrossingFinder()
     for gray in grays:
         finder.add(gray)
     return finder.found()
@@ -128,6 +130,11 @@ CONTRACTS = {
         lambda h, w: st.tuples(picture(h, w)),
         lambda r, a: is_single(r, *a.shape[:2]),
     ),
+    "luminance_halfs": Contract(
+        shadow_time.luminance_halfs,
+        lambda h, w: st.tuples(picture(h, w)),
+        lambda r, a: np.array_equal(r, rounded(shadow_time.luminance(a)), equal_nan=True),
+    ),
     "luminance of grey": Contract(
         lambda a: shadow_time.luminance(np.repeat(a[..., None], 3, axis=-1)),
         lambda h, w: st.tuples(plane(h, w, TAME)),
@@ -187,7 +194,7 @@ CONTRACTS = {
         ),
     ),
     "time_picture": Contract(
-        lambda image, time, turned: pictures.time_picture(image, time, turned[0]),
+        lambda image, time, turned: pictures.time_picture(pictures.display(image), time, turned[0]),
         lambda h, w: st.tuples(picture(h, w), plane(h, w, SOME), turning(h, w)),
         lambda r, image, *others: r.dtype == np.uint8 and r.shape == image.shape,
     ),

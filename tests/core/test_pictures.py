@@ -1,6 +1,6 @@
 import numpy as np
 
-from shadowtool.core.pictures import time_picture, warp_picture
+from shadowtool.core.pictures import display, time_picture, warp_picture
 from shadowtool.core.warp_map import WarpMap
 from tests.core.test_shadow_lines import SCENE, edge_times, fitted
 from tests.scene import Sweep
@@ -8,14 +8,14 @@ from tests.scene import Sweep
 
 def test_times_and_lines_are_drawn_over_the_frame() -> None:
     sweep = Sweep(0.5)
-    picture = time_picture(SCENE.lit, edge_times(sweep), fitted(sweep), SCENE.plane)
+    picture = time_picture(display(SCENE.lit), edge_times(sweep), fitted(sweep), SCENE.plane)
     assert picture.shape == (90, 160, 3) and picture.dtype == np.uint8
     assert ((picture[..., 1] > 200) & (picture[..., 0] < 120)).sum() > 200
 
 
 def test_a_pass_without_times_is_drawn_too() -> None:
     nothing = np.full((90, 160), np.nan, np.float32)
-    assert time_picture(SCENE.lit, nothing, fitted(Sweep(0.5))).shape == (90, 160, 3)
+    assert time_picture(display(SCENE.lit), nothing, fitted(Sweep(0.5))).shape == (90, 160, 3)
 
 
 def test_the_grid_breaks_at_the_block() -> None:

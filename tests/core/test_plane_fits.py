@@ -1,3 +1,5 @@
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,6 +31,71 @@ def by_hand(
     normal = design.T @ (design * weight[:, None]) + np.diag([1e-9, 0.1, 0.1])
     solved = np.linalg.solve(normal, design.T @ (weight * value[window].ravel()))
     return float(solved[0]), float(np.linalg.inv(normal)[0, 0])
+
+
+def fit_planes_one_by_one(
+    value: np.ndarray, error: np.ndarray, windows: Windows
+) -> tuple[np.ndarray, np.ndarray]:
+    """Each pixel and each window in turn, by plain least squares."""
+    best, spread = value.astype(np.float64), error.astype(np.float64) ** 2
+    for row, column in np.ndindex(value.shape):
+        around = (
+            np.abs(np.subtract.outer(np.arange(value.shape[0]), row)) <= 1,
+            (np.abs(np.subtract.outer(np.arange(value.shape[1]), column)) <= 1),
+        )
+        others, errors = value[np.ix_(*around)], error[np.ix_(*around)]
+        allowed = 3 * np.hypot(errors, error[row, column]) + 1
+        # A measurement agrees with itself.
+        if (np.abs(others - value[row, column]) < allowed).sum() - 1 < 3:
+            spread[row, column] = np.inf
+    weight = np.where(np.isfinite(spread), 1 / spread, 0)
+    own, own_weight = best.copy(), weight.copy()
+    y, x = np.mgrid[: value.shape[0], : value.shape[1]]
+    for radius in windows.radii:
+        smaller, smaller_spread = best.copy(), spread.copy()
+        for (row, column), (a, b) in product(
+            np.ndindex(value.shape), product((-radius, 0, radius), repeat=2)
+        ):
+            if not (0 <= row + a < value.shape[0] and 0 <= column + b < value.shape[1]):
+                continue
+            inside = (np.abs(y - row - a) <= radius) & (np.abs(x - column - b) <= radius)
+            inside &= weight > 0
+            if inside.sum() < 4:
+                continue
+            design = np.stack([np.ones(inside.sum()), x[inside] - column, y[inside] - row], 1)
+            level = np.array([[1, b, a], [0, 1, 0], [0, 0, 1]])
+            normal = design.T @ (design * weight[inside, None])
+            # As if windows had seen no slope, about their middle.
+            normal += level.T @ np.diag([1e-9, 0.1, 0.1]) @ level
+            plane = np.linalg.solve(normal, design.T @ (weight * value)[inside])
+            rest = weight[inside] @ value[inside] ** 2 - plane @ (
+                design.T @ (weight * value)[inside]
+            )
+            misfit = max(rest, 0) / max(inside.sum() - 3, 1)
+            certain = np.linalg.inv(normal)[0, 0] * max(misfit, 1) * windows.factor**2 + 0.02**2
+            off = plane[0] - np.array([own[row, column], smaller[row, column]])
+            if (
+                misfit < 1.5
+                and certain < spread[row, column]
+                and off[0] ** 2 * own_weight[row, column] < 9
+                and off[1] ** 2 <= 9 * smaller_spread[row, column]
+            ):
+                best[row, column], spread[row, column] = plane[0], certain
+    return best, np.sqrt(spread)
+
+
+@pytest.mark.parametrize("windows", [Windows((1, 2, 3, 5)), Windows((2, 5), 1.7), Windows((3, 8))])
+def test_each_pixel_is_given_what_its_windows_in_turn_give_it(windows: Windows) -> None:
+    rng = np.random.default_rng(3)
+    truth = np.where(COLUMNS < 9, 0.4 * ROWS, 7 - 0.3 * COLUMNS)[:14, :18]
+    error = rng.choice([0.05, 0.3, 0.8], truth.shape).astype(np.float32)
+    # Errors that are a little larger than they are said to be: windows of all sizes compete.
+    value = (truth + 1.2 * rng.normal(size=truth.shape) * error).astype(np.float32)
+    value[4, 5] = 30
+    fitted, spread = fit_planes(value, error, windows)
+    expected, expected_spread = fit_planes_one_by_one(value, error, windows)
+    assert fitted == pytest.approx(expected, abs=1e-3)
+    assert spread == pytest.approx(expected_spread, abs=1e-3)
 
 
 def test_a_single_centred_window_is_plain_least_squares() -> None:
@@ -101,6 +168,15 @@ def test_bands_of_the_picture_give_the_same() -> None:
     part, part_spread = fit_planes(value[first - REACH :], error[first - REACH :])
     assert np.array_equal(part[REACH:], whole[first:])
     assert np.array_equal(part_spread[REACH:], spread[first:])
+
+
+def test_rows_alone_are_those_of_the_whole() -> None:
+    value, error = measured(np.hypot(ROWS, COLUMNS), 0.5)
+    whole, spread = fit_planes(value, error)
+    for wanted in (slice(0, 1), slice(7, 31), slice(50, 60)):
+        part, part_spread = fit_planes(value, error, wanted=wanted)
+        assert np.array_equal(part, whole[wanted])
+        assert np.array_equal(part_spread, spread[wanted])
 
 
 def test_windows_grow_with_the_step() -> None:

@@ -1,15 +1,11 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
+from shadowtool.core.crossings import CrossingFinder, Crossings
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.shadow_time import (
     INTERVAL_ERROR,
-    LEAST_CONTRAST,
     SHADE,
-    CrossingFinder,
-    Crossings,
     interpolated_times,
     luminance,
     own_times,
@@ -28,20 +24,6 @@ def crossings_of(frames: list[np.ndarray]) -> Crossings:
     for frame in frames:
         finder.add(luminance(frame))
     return significant(finder.found(), NOISE)
-
-
-def crossings_in_two_readings(grays: list[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """Position, value before and value after the first crossing, by the definition."""
-    stack = np.stack(grays)
-    for number in range(1, len(stack)):
-        stack[number] = np.where(np.isfinite(stack[number]), stack[number], stack[number - 1])
-    threshold = (np.fmin.reduce(stack) + np.fmax.reduce(stack)) / 2
-    at = (stack < threshold).argmax(axis=0)
-    at[~(stack < threshold).any(axis=0)] = 0
-    before = np.take_along_axis(stack, np.maximum(at - 1, 0)[None], axis=0)[0]
-    after = np.take_along_axis(stack, at[None], axis=0)[0]
-    at[~np.isfinite(before)] = 0
-    return at, before, after
 
 
 def paper_times(frames: list[np.ndarray]) -> np.ndarray:
@@ -113,43 +95,6 @@ def test_contrast_is_the_range_of_the_luminance() -> None:
     crossings = crossings_of(sweep_frames(Sweep(0.0)))
     found = crossings.highest - crossings.lowest
     assert found == pytest.approx(luminance(SCENE.lit) - luminance(SCENE.shadow), abs=0.01)
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    st.integers(2, 40),
-    st.sampled_from([0.0, 1.0, 4.0, 9.0]),
-    st.floats(0, 0.1),
-    st.sampled_from([0.0, 0.02]),
-    st.integers(0, 2**32 - 1),
-)
-def test_one_reading_finds_what_two_find(
-    count: int, width: float, noise: float, broken: float, seed: int
-) -> None:
-    """Edges up to 9 frames wide, light that drifts, a second shadow, noise, broken pixels."""
-    rng = np.random.default_rng(seed)
-    arrival = rng.uniform(-5, count + 5, (6, 7))
-    again = arrival + rng.uniform(8, 15, arrival.shape)
-    grays = []
-    for number in range(count):
-        dark = [np.clip((number - t) / max(width, 1e-3) + 0.5, 0, 1) for t in (arrival, again)]
-        light = 1 - dark[0] * (number < arrival + 6 + width) - 0.9 * dark[1]
-        gray = np.maximum(light, 0.05) * (1 + 0.01 * number) + rng.normal(scale=noise, size=(6, 7))
-        gray[rng.uniform(size=gray.shape) < broken] = np.nan
-        grays.append(gray.astype(np.float32))
-    finder = CrossingFinder()
-    for gray in grays:
-        finder.add(gray)
-    found = finder.found()
-    at, before, after = crossings_in_two_readings(grays)
-    with np.errstate(invalid="ignore"):
-        seen = found.highest - found.lowest > LEAST_CONTRAST * found.highest
-    known = ~found.lost & seen
-    assert np.array_equal(found.at[known], at[known])
-    told = known & (at > 0)
-    assert np.array_equal(found.before[told], before[told])
-    assert np.array_equal(found.after[told], after[told])
-    assert (found.at[found.lost] == 0).all()
 
 
 @pytest.mark.parametrize(("soft", "most"), [(1.0, 0.002), (8.0, 0.002), (30.0, 0.02)])

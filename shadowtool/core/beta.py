@@ -327,7 +327,8 @@ def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> F
     # A pixel that was never shaded is no source to continue a shadow from only where it is itself
     # unknown; where it was set to 1 above it is as good as measured.
     np.copyto(filled, np.nan, where=hidden)
-    return inpaint(filled)
+    _inpaint(filled)
+    return filled
 
 
 def inpaint(image: Float32) -> Float32:
@@ -337,19 +338,24 @@ def inpaint(image: Float32) -> Float32:
         image: (H, W) float32.
 
     Returns:
-        (H, W) float32 without NaN, known pixels unchanged.
+        (H, W) float32 without NaN, a new array; known pixels unchanged.
     """
+    filled = image.copy()
+    _inpaint(filled)
+    return filled
+
+
+def _inpaint(image: Float32) -> None:
     unknown = ~np.isfinite(image)
     box = around(unknown, _RING)
     if box is None:
-        return image
-    if unknown.all():
-        return np.ones_like(image)
+        return
     hole = unknown[box]
+    if hole.all():
+        image[:] = 1
+        return
     values = np.where(hole, np.float32(0), image[box])
-    filled = image.copy()
-    filled[box] = fill_membrane(values[..., np.newaxis], (~hole).astype(np.float32))[..., 0]
-    return filled
+    image[box] = fill_membrane(values[..., np.newaxis], (~hole).astype(np.float32))[..., 0]
 
 
 def without_holes(never_shaded: Bool) -> Bool:

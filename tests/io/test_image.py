@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,44 @@ def test_files_are_zip_compressed_scanlines(exr):
         header = file.header()
         assert header["compression"] == OpenEXR.ZIP_COMPRESSION
         assert header["type"] == OpenEXR.scanlineimage
+
+
+def test_a_quick_file_holds_the_same(tmp_path):
+    values = np.tile(random(40, 16, 3), (1, 4, 1)).astype(np.float16)
+    for name, quick in (("slow", False), ("quick", True), ("slow2", False), ("quick2", True)):
+        write_exr(tmp_path / f"{name}.exr", {"RGB": values}, Header(64, 40), quick=quick)
+    slow, slow2, quick, quick2 = (
+        (tmp_path / f"{name}.exr").read_bytes() for name in ("slow", "slow2", "quick", "quick2")
+    )
+    assert slow == slow2 and quick == quick2
+    assert slow != quick
+    test_files_are_zip_compressed_scanlines(tmp_path / "quick.exr")
+    np.testing.assert_array_equal(read_image(tmp_path / "quick.exr").layers["RGB"], values)
+
+
+def test_quick_and_other_writers_do_not_mix(tmp_path):
+    values = np.tile(random(100, 40, 3), (1, 4, 1)).astype(np.float16)
+
+    def write(number):
+        path = tmp_path / f"{number}.exr"
+        write_exr(path, {"RGB": values}, quick=number % 3 == 0)
+        return path.stat().st_size
+
+    alone = [write(number) for number in (0, 1)]
+    with ThreadPoolExecutor(4) as pool:
+        sizes = list(pool.map(write, range(24)))
+    assert sizes == [alone[number % 3 != 0] for number in range(24)]
+
+
+def test_quick_files_are_written_where_openexr_hides_the_setting(tmp_path, monkeypatch):
+    def hidden(name):
+        raise OSError
+
+    monkeypatch.setattr("ctypes.CDLL", hidden)
+    values = random(40, 30, 3)
+    for quick in (True, False):
+        write_exr(tmp_path / "a.exr", {"RGB": values}, quick=quick)
+        np.testing.assert_array_equal(read_image(tmp_path / "a.exr").layers["RGB"], values)
 
 
 def test_the_fingerprint_is_the_files(exr):

@@ -29,7 +29,7 @@ _ONES, _BOX = np.ones((1, 3), np.float32), np.ones(_WINDOW, np.float32)
 # What is unknown is continued from what is this near, pixels.
 _RING = 2
 # So many pixels at a time stay in the processor's cache with all that is made of them.
-_PIXELS = 1 << 16
+_PIXELS = 1 << 17
 # Half the contrast's reciprocal more noise in full light, and so many deviations to be sure.
 _LIT_NOISE, _SURE = 0.7, 3.0
 
@@ -198,13 +198,13 @@ def without_noise(beta: Float32, weight: Float32) -> Float32:
     # Squares in units of their variance: of the pixel, the window's mean, and what is left.
     weighted *= off
     scatter = _window_sum(weighted)
-    square = mean * mean
+    shaded = weighted >= np.float32((_SURE + 1) ** 2)
+    square = np.multiply(mean, mean, out=weighted)
     square /= total
     mean /= total
+    shaded |= square >= np.float32(_SURE**2)
     scatter -= square
     scatter -= count
-    shaded = square >= np.float32(_SURE**2)
-    shaded |= weighted >= np.float32((_SURE + 1) ** 2)
     shaded |= scatter >= np.float32(_WINDOW**2) * count
     # Of the pixel's own value is kept structure / (structure + noise).
     np.maximum(scatter, 0, out=scatter)

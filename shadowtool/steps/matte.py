@@ -135,7 +135,10 @@ def matte(
         gain,
         output,
     )
-    work = FrameWork(recipe, output, take.products, take.sources, [stored.fingerprint], take.make)
+    shared = [stored.fingerprint]
+    # Plates in which something is unknown are not kept beside those that it was taken out of.
+    del stored
+    work = FrameWork(recipe, output, take.products, take.sources, shared, take.make)
     result = work.run(frames, run, absent, take.summary)
     if result.figures.get("hidden", 0) > _TOO_MUCH:
         logger.warning(
@@ -178,13 +181,13 @@ class _Scene:
         contrasts = [contrast]
         if beta == "rgb":
             contrasts = list(np.moveaxis(shadow_beta.channel_contrast(plates, noise), -1, 0))
-        gauge = shadow_beta.Gauge.of(plates, contrasts, never_shaded)
         unknown = np.isnan(contrast)
         lit, shadow = plates.lit, plates.shadow
         if unknown.any():
             lit, shadow = (
                 np.where(unknown[..., np.newaxis], np.float32(0), plate) for plate in (lit, shadow)
             )
+        gauge = shadow_beta.Gauge.of(Plates(lit, shadow), contrasts, never_shaded)
         step = grid_step(lit.shape[1], lit.shape[0])
         doubt = np.broadcast_to(np.float32(0), unknown.shape)
         if plates.shadow_frames is not None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
 from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
@@ -90,16 +91,30 @@ class Backdrop:
 
     def nearest(self, image: Float32) -> Nearest:
         """The background that is likest to each pixel of a frame (H, W, 3)."""
+        result = Nearest(*(np.empty(image.shape[:2], np.float32) for _ in Nearest._fields))
+        for rows in bands(image.shape):
+            found = self.at((rows,))._nearest(image[rows])
+            for whole, part in zip(result, found, strict=True):
+                whole[rows] = part
+        return result
+
+    def _nearest(self, image: Float32) -> Nearest:
         shape = image.shape[:2]
         square, from_lit2 = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         dots = np.zeros((2, *shape), np.float32)
         lengths = np.full((2, *shape), 1e-9, np.float32)
-        variance = self.variance(image)
-        # By channel: sums over an axis of three are slow.
+        # By channel: sums over an axis of three are slow, and so is what lies apart in memory.
         for channel in range(3):
-            weight = 1 / variance[..., channel]
-            shadow = self.shadow[..., channel]
-            above, span = image[..., channel] - shadow, self.lit[..., channel] - shadow
+            value, lit, shadow = (
+                np.ascontiguousarray(colours[..., channel])
+                for colours in (image, self.lit, self.shadow)
+            )
+            slope, floor = (np.float32(v[channel]) for v in (self.noise.slope, self.noise.floor))
+            above, span = value - shadow, lit - shadow
+            np.maximum(value, 0, out=value)
+            own = (np.float32(_TOLERANCE) * value) ** 2
+            own += (self.doubt * np.minimum(value, shadow)) ** 2
+            weight = 1 / (value * slope + floor + own)
             square += weight * above**2
             from_lit2 += weight * (above - span) ** 2
             for direction, dot, length in zip((span, shadow), dots, lengths, strict=True):

@@ -1,16 +1,22 @@
 """The shadow matte β: how much of the key light reaches each pixel (section 2)."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.choices import Fill
-from shadowtool.core.bands import bands
+from shadowtool.choices import Beta, Fill
+from shadowtool.core.bands import bands, in_all_channels, overlapping_bands
+from shadowtool.core.boxes import Box, around
+from shadowtool.core.exposure import without_gain
 from shadowtool.core.filling import fill_membrane
-from shadowtool.core.half_floats import to_float
+from shadowtool.core.half_floats import to_float, to_half
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plates import Plates
 
+Float16 = NDArray[np.float16]
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
@@ -19,57 +25,68 @@ _LARGEST_HOLE = 0.005
 # Below this many standard deviations between L and S, β would be off by more than 0.1.
 _LEAST_CONTRAST = 10.0
 _WINDOW = 5
-_ONES = np.ones((1, 3), np.float32)
+_ONES, _BOX = np.ones((1, 3), np.float32), np.ones(_WINDOW, np.float32)
+# What is unknown is continued from what is this near, pixels.
+_RING = 2
+# So many pixels at a time stay in the processor's cache with all that is made of them.
+_PIXELS = 1 << 17
 # Half the contrast's reciprocal more noise in full light, and so many deviations to be sure.
 _LIT_NOISE, _SURE = 0.7, 3.0
 
 
-def shadow_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> Float32:
+def inverse_span(lit: Float32, shadow: Float32, beta: Beta = "scalar") -> Float32:
+    """What C - S is multiplied by to give β, the same for every frame.
+
+    The vector (L - S) / ‖L - S‖² of Eq. (5), whose product with C - S is summed over the channels;
+    with ``rgb`` 1 / (L - S) in each, for coloured glass and caustics (section 7 of the paper).
+
+    Args:
+        lit, shadow: (H, W, 3) float32, linear light.
+
+    Returns:
+        (H, W, 3) float32; NaN where L = S, in all channels or in the one, or a plate is NaN.
+    """
+    inverse = np.empty_like(lit)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        for rows in bands(lit.shape):
+            span = lit[rows] - shadow[rows]
+            if beta == "rgb":
+                np.divide(1, span, out=inverse[rows])
+            else:
+                np.divide(span, in_all_channels(_sum(span * span)), out=inverse[rows])
+            inverse[rows][~np.isfinite(inverse[rows])] = np.nan
+    return inverse
+
+
+def shadow_matte(
+    image: NDArray[np.floating], shadow: Float32, inverse: Float32, beta: Beta = "scalar"
+) -> Float32:
     """Visibility of the key light by projection onto the line from S to L.
 
     Eq. (5) of Chuang et al. 2003: β = (C - S)·(L - S) / ‖L - S‖².
 
     Args:
-        image, lit, shadow: (H, W, 3), linear light.
+        image, shadow: (H, W, 3), linear light.
+        inverse: (H, W, 3) float32, from `inverse_span`.
 
     Returns:
-        (H, W) float32, not clipped; NaN where L = S in all channels or anything is NaN.
+        (H, W) float32, with ``rgb`` (H, W, 3), not clipped; NaN or infinite where anything is.
     """
-    beta = np.empty(lit.shape[:2], np.float32)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        for rows in bands(beta.shape):
-            span = lit[rows] - shadow[rows]
-            above = to_float(image[rows]) - shadow[rows]
-            above *= span
-            span *= span
-            projection, length = _sum(above), _sum(span)
-            np.divide(projection, length, out=beta[rows])
-            beta[rows][~((length > 0) & np.isfinite(projection))] = np.nan
-    return beta
+    result = np.empty(shadow.shape[: 2 if beta == "scalar" else 3], np.float32)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for rows in bands(shadow.shape):
+            # Halfs are converted on the way.
+            above = np.asarray(
+                cv2.subtract(image[rows], shadow[rows], dtype=cv2.CV_32F), np.float32
+            )
+            above *= inverse[rows]
+            result[rows] = _sum(above) if beta == "scalar" else above
+    return result
 
 
 def _sum(image: Float32) -> Float32:
     """The sum of three channels, (H, W)."""
     return np.asarray(cv2.transform(image, _ONES), np.float32)
-
-
-def coloured_matte(image: NDArray[np.floating], lit: Float32, shadow: Float32) -> Float32:
-    """Visibility of the key light in each channel: β = (C - S) / (L - S), for coloured glass and
-    caustics (section 7 of the paper).
-
-    Args:
-        image, lit, shadow: (H, W, 3), linear light.
-
-    Returns:
-        (H, W, 3) float32, not clipped; NaN where L = S in the channel or anything is NaN.
-    """
-    beta = np.empty(lit.shape, np.float32)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        for rows in bands(beta.shape):
-            above = to_float(image[rows]) - shadow[rows]
-            np.divide(above, lit[rows] - shadow[rows], out=beta[rows])
-            beta[rows][~np.isfinite(beta[rows])] = np.nan
-    return beta
 
 
 def channel_contrast(plates: Plates, noise: NoiseModel) -> Float32:
@@ -120,7 +137,36 @@ def unknown_beta(contrast: Float32, frames: NDArray[np.uint32] | None) -> Bool:
     return np.asarray(~(contrast > least))
 
 
-def without_noise(beta: Float32, contrast: Float32) -> Float32:
+def confidence(contrast: Float32) -> Float16:
+    """How far β can be relied on: 1 minus its standard error.
+
+    Args:
+        contrast: (H, W), from `shadow_contrast`.
+
+    Returns:
+        (H, W) float16 in [0, 1]; 0 where the contrast is NaN.
+    """
+    result = np.empty(contrast.shape, np.float16)
+    for rows in bands(contrast.shape, channels=1):
+        error = 1 / np.fmax(contrast[rows], np.float32(1e-6))
+        result[rows] = to_half(np.maximum(1 - error, 0))
+    return result
+
+
+def weight_of(contrast: Float32) -> Float32:
+    """What a pixel counts by in `without_noise`: the reciprocal of β's variance in full light.
+
+    Args:
+        contrast: (H, W), 1 over the standard error of β half-way between light and shadow.
+
+    Returns:
+        (H, W) float32 ≥ 0; 0 where the contrast is NaN.
+    """
+    deviations = np.fmax(contrast, 0) * np.float32(_LIT_NOISE)
+    return np.asarray(deviations * deviations, np.float32)
+
+
+def without_noise(beta: Float32, weight: Float32) -> Float32:
     """β cleared of noise as far as the picture around it allows; exactly 1 where it is lit.
 
     A Wiener filter over a small window: what a pixel's neighbours scatter beyond their noise is
@@ -128,62 +174,131 @@ def without_noise(beta: Float32, contrast: Float32) -> Float32:
     pixel nor the window's mean differs from 1 by more than their noise, β is 1.
 
     Args:
-        beta: (H, W) float32, not clipped; NaN unknown, which takes no part.
-        contrast: (H, W), 1 over the standard error of each pixel's β.
+        beta: (H, W) float32, not clipped; unknown where it is not finite, which takes no part.
+        weight: (H, W) float32 ≥ 0, the reciprocal of each pixel's variance in full light; where it
+            is 0 the pixel takes no part and is left as it is.
 
     Returns:
-        (H, W) float32 with the same NaN; within the range of what went in.
+        (H, W) float32, NaN where β is unknown; within the range of what went in.
     """
-    result = np.empty_like(beta)
-    reach = _WINDOW // 2
-    height = beta.shape[0]
-    for rows in bands(beta.shape, channels=1):
-        above, below = min(rows.start, reach), min(height - rows.stop, reach)
-        taken = slice(rows.start - above, rows.stop + below)
-        cleared = _without_noise(beta[taken], contrast[taken])
-        result[rows] = cleared[above : cleared.shape[0] - below]
-    return result
-
-
-def _without_noise(beta: Float32, contrast: Float32) -> Float32:
-    """`without_noise` of a few rows, right but for what lies beyond them."""
-    known = np.isfinite(beta) & np.isfinite(contrast) & (contrast > 0)
-    # In the light the noise is larger than half-way, for which the contrast stands.
-    unknown = ~known
-    deviations = contrast * np.float32(_LIT_NOISE)
-    deviations[unknown] = 0
-    weight = deviations * deviations
-    values = beta.copy()
-    values[unknown] = 1
+    # From 1: in the light there is least to be rounded away.
+    off = beta - np.float32(1)
+    known = np.isfinite(off)
+    known &= weight > 0
+    all_known = bool(known.all())
+    count: Float32 | np.float32 = np.float32(_WINDOW**2)
+    if not all_known:
+        np.copyto(off, 0, where=~known)
+        weight = weight * known
+        count = _window_sum(known.astype(np.float32))
     total = _window_sum(weight)
-    safe = np.maximum(total, np.float32(1e-12))
-    weighted = weight * values
+    total += np.float32(1e-12)
+    weighted = weight * off
     mean = _window_sum(weighted)
-    mean /= safe
-    weighted *= values
+    # Squares in units of their variance: of the pixel, the window's mean, and what is left.
+    weighted *= off
     scatter = _window_sum(weighted)
-    scatter /= safe
-    scatter -= mean * mean
-    noise = _window_sum(known.astype(np.float32))
-    noise /= safe
-    structure = np.maximum(scatter, 0) - noise
-    np.maximum(structure, 0, out=structure)
-    keep = structure / (structure + 1 / np.maximum(weight, np.float32(1e-12)))
-    keep *= values - mean
-    keep += mean
-    lit = np.abs(1 - mean) * np.sqrt(total) < _SURE
-    lit &= np.abs(1 - values) * deviations < _SURE + 1
-    lit &= structure < noise * np.float32(_WINDOW**2)
-    keep[lit] = 1
-    np.copyto(keep, beta, where=unknown)
-    return np.asarray(keep, np.float32)
+    shaded = weighted >= np.float32((_SURE + 1) ** 2)
+    square = np.multiply(mean, mean, out=weighted)
+    square /= total
+    mean /= total
+    shaded |= square >= np.float32(_SURE**2)
+    scatter -= square
+    scatter -= count
+    shaded |= scatter >= np.float32(_WINDOW**2) * count
+    # Of the pixel's own value is kept structure / (structure + noise).
+    np.maximum(scatter, 0, out=scatter)
+    scatter *= weight
+    total += scatter
+    scatter /= total
+    off -= mean
+    off *= scatter
+    off += mean
+    off *= shaded
+    off += np.float32(1)
+    if not all_known:
+        left = np.where(np.isfinite(beta), beta, np.float32(np.nan))
+        np.copyto(off, left, where=~known)
+    return off
 
 
 def _window_sum(image: Float32) -> Float32:
-    """The sum over the window around each pixel, (H, W)."""
-    box = (_WINDOW, _WINDOW)
-    total = cv2.boxFilter(image, -1, box, normalize=False, borderType=cv2.BORDER_REFLECT)
+    """The sum over the window around each pixel, (H, W); it rests on nothing beyond the window."""
+    total = cv2.sepFilter2D(image, -1, _BOX, _BOX, borderType=cv2.BORDER_REFLECT)
     return np.asarray(total, np.float32)
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """What β is measured by in every frame of a take.
+
+    Attributes:
+        shadow: (H, W, 3) float32, S.
+        inverse: (H, W, 3) float32, from `inverse_span`; NaN where β can't be known.
+        weights: for each plane of β (H, W) float32, from `weight_of`.
+    """
+
+    shadow: Float32
+    inverse: Float32
+    weights: tuple[Float32, ...]
+
+    @classmethod
+    def of(cls, plates: Plates, contrasts: Sequence[Float32], unknown: Bool) -> "Gauge":
+        """From the plates, β's `shadow_contrast` or that of each channel, and (H, W) where β can't
+        be known."""
+        kind: Beta = "scalar" if len(contrasts) == 1 else "rgb"
+        inverse = inverse_span(plates.lit, plates.shadow, kind)
+        inverse[unknown] = np.nan
+        return cls(plates.shadow, inverse, tuple(map(weight_of, contrasts)))
+
+    def measure(
+        self,
+        image: NDArray[np.floating],
+        unseen: Bool,
+        gain: float = 1,
+        ground: tuple[Box, Float32] | None = None,
+        clamp: bool = False,
+    ) -> Float32:
+        """β of a frame, projected and cleared of noise a few rows at a time.
+
+        Args:
+            image: (H, W, 3), linear light.
+            unseen: (H, W), where the frame does not show the ground.
+            gain: how much brighter than the plates the frame is.
+            ground: rows and columns of a part of the frame, and what is seen of the ground there
+                at gain 1, (h, w, 3).
+            clamp: keep β within 0 and 1.
+
+        Returns:
+            (H, W) float32, or (H, W, 3) for a plane in each channel; NaN unknown.
+        """
+        kind: Beta = "scalar" if len(self.weights) == 1 else "rgb"
+        result = np.empty(image.shape[: 2 if kind == "scalar" else 3], np.float32)
+        height, width = image.shape[:2]
+        step = max(1, _PIXELS // max(width, 1))
+        for taken, own in overlapping_bands(height, _WINDOW // 2, step):
+            light = without_gain(to_float(image[taken]), gain) if gain != 1 else image[taken]
+            beta = shadow_matte(light, self.shadow[taken], self.inverse[taken], kind)
+            if ground is not None:
+                self._project(beta, taken, *ground)
+            beta[unseen[taken]] = np.nan
+            planes = np.atleast_3d(beta)
+            for channel, weight in enumerate(self.weights):
+                cleared = without_noise(planes[..., channel], weight[taken])[own]
+                if clamp:
+                    np.clip(cleared, 0, 1, out=cleared)
+                np.atleast_3d(result[taken][own])[..., channel] = cleared
+        return result
+
+    def _project(self, beta: Float32, taken: slice, box: Box, ground: Float32) -> None:
+        """Put β of what is seen in a box into that of some rows."""
+        rows = slice(max(box.rows.start, taken.start), min(box.rows.stop, taken.stop))
+        if rows.start < rows.stop:
+            part = ground[rows.start - box.rows.start : rows.stop - box.rows.start]
+            place = (rows, box.columns)
+            kind: Beta = "scalar" if beta.ndim == 2 else "rgb"
+            found = shadow_matte(part, self.shadow[place], self.inverse[place], kind)
+            beta[rows.start - taken.start : rows.stop - taken.start, box.columns] = found
 
 
 def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> Float32:
@@ -206,13 +321,14 @@ def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> F
     if fill == "none":
         return filled
     if fill == "lit":
-        filled[np.isnan(filled)] = 1
+        np.copyto(filled, 1, where=np.isnan(filled))
         return filled
-    filled[never_reached] = 1
+    np.copyto(filled, 1, where=never_reached)
     # A pixel that was never shaded is no source to continue a shadow from only where it is itself
     # unknown; where it was set to 1 above it is as good as measured.
-    filled[hidden] = np.nan
-    return inpaint(filled)
+    np.copyto(filled, np.nan, where=hidden)
+    _inpaint(filled)
+    return filled
 
 
 def inpaint(image: Float32) -> Float32:
@@ -222,16 +338,24 @@ def inpaint(image: Float32) -> Float32:
         image: (H, W) float32.
 
     Returns:
-        (H, W) float32 without NaN, known pixels unchanged.
+        (H, W) float32 without NaN, a new array; known pixels unchanged.
     """
-    known = np.isfinite(image)
-    if known.all():
-        return image
-    if not known.any():
-        return np.ones_like(image)
-    values = image.copy()
-    values[~known] = 0
-    return fill_membrane(values[..., np.newaxis], known.astype(np.float32))[..., 0]
+    filled = image.copy()
+    _inpaint(filled)
+    return filled
+
+
+def _inpaint(image: Float32) -> None:
+    unknown = ~np.isfinite(image)
+    box = around(unknown, _RING)
+    if box is None:
+        return
+    hole = unknown[box]
+    if hole.all():
+        image[:] = 1
+        return
+    values = np.where(hole, np.float32(0), image[box])
+    image[box] = fill_membrane(values[..., np.newaxis], (~hole).astype(np.float32))[..., 0]
 
 
 def without_holes(never_shaded: Bool) -> Bool:

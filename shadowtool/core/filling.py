@@ -45,7 +45,8 @@ def _fill_parts(filled: Float32, weight: Float32) -> None:
     for label, (rows, columns) in boxes.items():
         patch = _fill(values[rows, columns], np.ascontiguousarray(weight[rows, columns]))
         own = labels[rows, columns] == label
-        filled[rows, columns][own] = patch[own]
+        for channel in range(values.shape[2]):
+            np.copyto(filled[rows, columns, channel], patch[..., channel], where=own)
 
 
 def _parts(
@@ -92,12 +93,17 @@ def _fill(values: Float32, weight: Float32) -> Float32:
     small = np.asarray(_halved(weighted) / divisor, np.float32)
     double = (2 * half[0], 2 * half[1])
     stretched = cv2.resize(_fill(small, small_weight), double, interpolation=cv2.INTER_LINEAR)
-    large = stretched.reshape(double[1], double[0], -1)[:height, :width]
-    filled = np.where(known[..., None], values, large).astype(np.float32)
+    held, mask = _for_opencv(values), known.view(np.uint8)
+    filled = cv2.copyTo(held, mask, np.ascontiguousarray(stretched[:height, :width]))
     for _ in range(_RELAXATIONS):
-        around = cv2.filter2D(filled, -1, _CROSS, borderType=cv2.BORDER_REFLECT)
-        filled = np.where(known[..., None], values, around.reshape(values.shape))
-    return filled
+        filled = cv2.filter2D(filled, -1, _CROSS, borderType=cv2.BORDER_REFLECT)
+        cv2.copyTo(held, mask, filled)
+    return np.asarray(filled, np.float32).reshape(values.shape)
+
+
+def _for_opencv(values: Float32) -> Float32:
+    # It drops an axis of a single channel, and takes most time where that is to be kept.
+    return np.ascontiguousarray(values[..., 0] if values.shape[2] == 1 else values)
 
 
 def _halved(image: Float32) -> Float32:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.boxes import around
 from shadowtool.core.detection import Found, changed, find_figure
 from shadowtool.core.known_background import colours, ground_beta, solve
 from shadowtool.core.trimap import (
@@ -21,12 +22,11 @@ from shadowtool.core.trimap import (
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
-Box = tuple[slice, slice]
 
 # Edges are looked for this far inwards: pixels, and of wide pictures a part of their width.
 _REACH, _REACH_PART = 4, 1 / 240
 # So much of the surroundings is worked on too, pixels.
-_MARGIN = 16
+MARGIN = 16
 # From this alpha on the ground behind is not told by what is seen past the figure.
 HIDDEN = 0.5
 # Alpha as near as this to 0 or 1 is noise.
@@ -73,7 +73,7 @@ def pull_figure(
         drawn = np.full((height, width), UNKNOWN, np.uint8)
     trimap = np.where(drawn == FIGURE, FIGURE, BACKGROUND)
     seen, unknown, bad = _without_unknown(image, backdrop, unknown)
-    box = _around(changed(seen, backdrop) | (trimap == FIGURE))
+    box = around(changed(seen, backdrop) | (trimap == FIGURE), MARGIN)
     if box is None:
         return Figure(foreground, alpha, trimap)
     reach = max(_REACH, round(_REACH_PART * width))
@@ -101,20 +101,21 @@ def pull_figure(
 def colour_figure(image: Float32, backdrop: Backdrop, unknown: Bool, alpha: Float32) -> Figure:
     """The colour of a figure whose alpha is given; arguments and result as for `pull_figure`.
 
+    All of them may be of a part of the picture that holds the figure and a margin of `MARGIN`.
+
     Args:
         alpha: (H, W) float32 in [0, 1], kept as it is.
     """
-    height, width = alpha.shape
-    foreground = np.zeros((height, width, 3), np.float32)
     trimap = np.where(alpha >= 1, FIGURE, np.where(alpha > 0, UNKNOWN, BACKGROUND))
-    box = _around(alpha > 0)
+    foreground = np.zeros(image.shape, np.float32)
+    box = around(alpha > 0, MARGIN)
     if box is not None:
-        seen, unknown, bad = _without_unknown(image, backdrop, unknown)
-        part, ground = seen[box], backdrop.at(box)
-        seen_ground = (alpha[box] == 0) & ~unknown[box]
-        behind = ground_beta(ground.nearest(part).beta, seen_ground)
-        foreground[box] = alpha[box][..., np.newaxis] * colours(part, alpha[box], behind, ground)
-        foreground[bad] = 0
+        part, ground, cover = image[box], backdrop.at(box), alpha[box]
+        seen, unknown, bad = _without_unknown(part, ground, unknown[box])
+        behind = ground_beta(ground.nearest(seen).beta, (cover == 0) & ~unknown)
+        colour = cover[..., np.newaxis] * colours(seen, cover, behind, ground)
+        colour[bad] = 0
+        foreground[box] = colour
     return Figure(foreground, alpha, np.asarray(trimap, np.uint8))
 
 
@@ -139,18 +140,6 @@ def _without_unknown(
     if not bad.any():
         return image, unknown, bad
     return np.where(bad[..., np.newaxis], backdrop.lit, image), unknown | bad, bad
-
-
-def _around(mask: Bool) -> Box | None:
-    """The rows and columns of a mask with a margin; None if it is empty."""
-    bounds = []
-    for axis, size in ((1, mask.shape[0]), (0, mask.shape[1])):
-        places = np.flatnonzero(mask.any(axis=axis))
-        if not places.size:
-            return None
-        first, last = int(places[0]), int(places[-1])
-        bounds.append(slice(max(first - _MARGIN, 0), min(last + _MARGIN + 1, size)))
-    return bounds[0], bounds[1]
 
 
 def _within(found: Found, drawn: UInt8) -> Found:

@@ -12,7 +12,7 @@ import struct
 import threading
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -164,10 +164,6 @@ class Image:
             if layer in ("RGB", "RGBA") and len(name) == 1 and name in layer:
                 return _unit(_one_channel(values, layer.index(name)))
         raise InputError(f"{self.path}: has no channel {name}, only {', '.join(self.layers)}")
-
-    def part(self, rows: slice) -> "Image":
-        """Some rows of the picture; nothing is copied."""
-        return replace(self, layers={name: values[rows] for name, values in self.layers.items()})
 
     def _colour_layer(self) -> str:
         for name in ("RGB", "RGBA"):

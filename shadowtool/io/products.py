@@ -78,8 +78,8 @@ def read_plates(folder: Path) -> StoredPlates:
             shadow_frames = _counts(image.channel("shadow_frames"))
         if image.header.size != lit.header.size:
             raise InputError(f"{confidence}: is not of the plates' size")
-    colours = (lit.rgb().astype(np.float32), shadow.rgb().astype(np.float32))
-    plates = Plates(*colours, frames, shadow_frames)
+    light, shade = (image.rgb().astype(np.float32, copy=False) for image in (lit, shadow))
+    plates = Plates(light, shade, frames, shadow_frames)
     return StoredPlates(plates, lit.header, " ".join(i.fingerprint for i in images))
 
 

@@ -1,6 +1,8 @@
 """The figure and its shadow in the target scene."""
 
 import logging
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from shadowtool.choices import Fill, Format
 from shadowtool.core.bands import bands
 from shadowtool.core.beta import inpaint
+from shadowtool.core.boxes import Box
 from shadowtool.core.compositing import over, shade, shadow_ratio
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.half_floats import to_float, to_half
@@ -34,6 +37,7 @@ logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 RATIO_FOLDER = "ratio"
+_PIXEL = Box(slice(0, 1), slice(0, 1))
 
 
 def composite(
@@ -110,15 +114,20 @@ def composite(
             visibility = sample(visibility, places, outside=1.0)
         result = np.empty(lit.shape, np.float16 if suffix == EXR else np.uint16)
         ratios = np.empty(lit.shape, np.float16) if ratio else None
+        box = _figure_box(figure)
         bad = 0
         for rows in bands(lit.shape):
-            colour, alpha, own = _figure(figure.part(rows))
-            bad += own
-            shaded = shade(lit[rows], shadow[rows], visibility[rows])
-            coded = over(colour, alpha, shaded)
-            result[rows] = to_half(coded) if suffix == EXR else to_code(coded)
+            coded = shade(lit[rows], shadow[rows], visibility[rows])
             if ratios is not None:
-                ratios[rows] = to_half(shadow_ratio(shaded, lit[rows]))
+                ratios[rows] = to_half(shadow_ratio(coded, lit[rows]))
+            if (part := _in_rows(box, rows)) is not None:
+                colour, alpha, own = _figure(figure, part)
+                bad += own
+                first, last = part.rows.start - rows.start, part.rows.stop - rows.start
+                coded[first:last, part.columns] = over(
+                    colour, alpha, coded[first:last, part.columns]
+                )
+            result[rows] = to_half(coded) if suffix == EXR else to_code(coded)
         figures = {"unknown": unknown, "not_finite": bad}
         marked = with_figures(provenance, figures)
         target, *more = products(frame)
@@ -173,10 +182,37 @@ def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, 
     return values, int(holes.any(axis=-1).sum() if holes.ndim == 3 else holes.sum())
 
 
-def _figure(image: Image) -> tuple[Float32, Float32, int]:
-    """Premultiplied colour (H, W, 3), alpha (H, W) in [0, 1], and in how many pixels there is NaN
-    or infinity, which becomes nothing."""
-    colour, alpha = image.rgba()
+def _figure_box(image: Image) -> Box:
+    """What holds all that is not 0 in any channel; a single pixel if nothing is."""
+    boxes = []
+    for values in image.layers.values():
+        height, width = values.shape[:2]
+        # Integers are compared many times faster than halfs.
+        bits = np.ascontiguousarray(values).view(f"u{values.itemsize}").reshape(height, -1)
+        rows = np.flatnonzero(bits.max(axis=1))
+        if rows.size:
+            there = slice(int(rows[0]), int(rows[-1]) + 1)
+            columns = np.flatnonzero(bits[there].max(axis=0).reshape(width, -1).max(axis=1))
+            boxes.append(Box(there, slice(int(columns[0]), int(columns[-1]) + 1)))
+    return Box(*(_hull(parts) for parts in zip(*boxes, strict=True))) if boxes else _PIXEL
+
+
+def _hull(parts: Iterable[slice]) -> slice:
+    starts, stops = zip(*((part.start, part.stop) for part in parts), strict=True)
+    return slice(min(starts), max(stops))
+
+
+def _in_rows(box: Box, rows: slice) -> Box | None:
+    """The part of a box that lies in some rows."""
+    first, last = max(box.rows.start, rows.start), min(box.rows.stop, rows.stop)
+    return Box(slice(first, last), box.columns) if first < last else None
+
+
+def _figure(image: Image, box: Box) -> tuple[Float32, Float32, int]:
+    """Of a part of the picture premultiplied colour (h, w, 3), alpha (h, w) in [0, 1], and in how
+    many pixels there is NaN or infinity, which becomes nothing."""
+    part = {name: np.ascontiguousarray(values[box]) for name, values in image.layers.items()}
+    colour, alpha = replace(image, layers=part).rgba()
     count = 0
     if not (np.isfinite(colour).all() and np.isfinite(alpha).all()):
         bad = ~(np.isfinite(colour).all(axis=-1) & np.isfinite(alpha))

@@ -11,12 +11,20 @@ from numpy.typing import NDArray
 from shadowtool.choices import Beta, Fill, Gain, Only
 from shadowtool.core import beta as shadow_beta
 from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.boxes import Box, around
 from shadowtool.core.exposure import frame_gain, without_gain
 from shadowtool.core.half_floats import to_float
 from shadowtool.core.holdout import grid_step, on_grid
-from shadowtool.core.matting import HIDDEN, Figure, colour_figure, pull_figure, without_figure
+from shadowtool.core.matting import (
+    HIDDEN,
+    MARGIN,
+    Figure,
+    colour_figure,
+    pull_figure,
+    without_figure,
+)
 from shadowtool.core.noise import NoiseModel
-from shadowtool.core.plates import Plates
+from shadowtool.core.plates import Plates, seen_pixels
 from shadowtool.errors import OptionError
 from shadowtool.io.image import EXR, PNG, Header, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import read_plates
@@ -27,11 +35,15 @@ from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_f
 
 logger = logging.getLogger(__name__)
 
+Float16 = NDArray[np.float16]
 Float32 = NDArray[np.float32]
+UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
 # By how much a shadow plate may be off where no frame showed full shadow.
 _GUESSED = 0.04
+# The box of a figure that isn't there.
+_NONE = Box(slice(0, 0), slice(0, 0))
 # A figure larger than this part of the picture is none.
 _TOO_MUCH = 0.5
 
@@ -113,7 +125,7 @@ def matte(
         wanted = tuple(product for product in wanted if product != "trimap")
     take = _Take(
         footage,
-        _Scene.of(stored.plates, noise, footage.header, beta),
+        _Scene.of(stored.plates, noise, beta),
         given.get("alpha"),
         keyframes,
         wanted,
@@ -123,7 +135,10 @@ def matte(
         gain,
         output,
     )
-    work = FrameWork(recipe, output, take.products, take.sources, [stored.fingerprint], take.make)
+    shared = [stored.fingerprint]
+    # Plates in which something is unknown are not kept beside those that it was taken out of.
+    del stored
+    work = FrameWork(recipe, output, take.products, take.sources, shared, take.make)
     result = work.run(frames, run, absent, take.summary)
     if result.figures.get("hidden", 0) > _TOO_MUCH:
         logger.warning(
@@ -139,62 +154,88 @@ class _Scene:
     """The plates, and what follows from them for all frames.
 
     Attributes:
-        plates: as they were read.
-        backdrop: the same without NaN.
+        backdrop: the plates, without NaN.
         unknown: (H, W), a plate is NaN.
-        never_shaded: (H, W), β can't be known.
-        never_reached: (H, W), nor is it a hole in what is.
-        contrasts: (H, W) for each plane of β.
-        confidence: (H, W), of β where it is measured.
+        never_reached: (H, W), β can't be known, nor is it a hole in what is.
+        gauge: what β is measured by.
+        confidence: (H, W) float16, of β where it is measured.
         step, reference: the grid and its lit colours that exposure is measured by.
     """
 
-    plates: Plates
     backdrop: Backdrop
     unknown: Bool
-    never_shaded: Bool
     never_reached: Bool
-    contrasts: list[Float32]
-    confidence: Float32
+    gauge: shadow_beta.Gauge
+    confidence: Float16
     step: int
     reference: Float32
 
     @classmethod
-    def of(cls, plates: Plates, noise: NoiseModel, header: Header, beta: Beta) -> "_Scene":
+    def of(cls, plates: Plates, noise: NoiseModel, beta: Beta) -> "_Scene":
         contrast = shadow_beta.shadow_contrast(plates, noise)
         # Means have no range of extremes to allow for.
         frames = plates.frames if plates.shadow_frames is None else None
         never_shaded = shadow_beta.unknown_beta(contrast, frames)
-        confidence = np.asarray(np.clip(1 - 1 / np.maximum(contrast, 1e-6), 0, 1), np.float32)
+        confidence = shadow_beta.confidence(contrast)
         confidence[never_shaded] = 0
         contrasts = [contrast]
         if beta == "rgb":
             contrasts = list(np.moveaxis(shadow_beta.channel_contrast(plates, noise), -1, 0))
-        known = np.isfinite(plates.lit) & np.isfinite(plates.shadow)
-        unknown = np.asarray(~known.all(axis=-1))
-        lit, shadow = (
-            np.where(unknown[..., np.newaxis], np.float32(0), plate)
-            for plate in (plates.lit, plates.shadow)
-        )
-        step = grid_step(*header.size)
-        reference = on_grid(lit, step)
-        doubt = np.zeros(contrast.shape, np.float32)
+        unknown = np.isnan(contrast)
+        lit, shadow = plates.lit, plates.shadow
+        if unknown.any():
+            lit, shadow = (
+                np.where(unknown[..., np.newaxis], np.float32(0), plate) for plate in (lit, shadow)
+            )
+        gauge = shadow_beta.Gauge.of(Plates(lit, shadow), contrasts, never_shaded)
+        step = grid_step(lit.shape[1], lit.shape[0])
+        doubt = np.broadcast_to(np.float32(0), unknown.shape)
         if plates.shadow_frames is not None:
-            doubt[plates.shadow_frames == 0] = _GUESSED
+            doubt = np.where(plates.shadow_frames == 0, np.float32(_GUESSED), np.float32(0))
         backdrop = Backdrop(lit, shadow, noise, doubt)
         reached = shadow_beta.without_holes(never_shaded)
-        return cls(
-            plates, backdrop, unknown, never_shaded, reached, contrasts, confidence, step, reference
-        )
+        return cls(backdrop, unknown, reached, gauge, confidence, step, on_grid(lit, step))
 
 
 class _Shown(NamedTuple):
-    """A frame at gain 1, NaN where it is not finite, with its header."""
+    """A frame.
 
-    image: Float32
+    Attributes:
+        light: (H, W, 3), linear light as it is stored.
+        header: the file's.
+        bad: (H, W), where it is not finite; None for nowhere.
+        gain: how much brighter than the plates it is.
+    """
+
+    light: NDArray[np.floating]
     header: Header
+    bad: Bool | None
     gain: float
-    bad: int
+
+    def at(self, box: Box) -> Float32:
+        """A part of it at gain 1, NaN where it is not finite."""
+        image = to_float(self.light[box])
+        if self.bad is not None:
+            image = np.where(self.bad[box][..., np.newaxis], np.float32(np.nan), image)
+        return without_gain(image, self.gain).astype(np.float32, copy=False)
+
+
+class _Figure(NamedTuple):
+    """The figure in a frame.
+
+    Attributes:
+        alpha: (H, W) float32 in [0, 1].
+        trimap: (H, W) uint8, where one was made.
+        box: what holds all of it.
+        foreground: of the box, (h, w, 3) float32, premultiplied.
+        ground: of the box, (h, w, 3) float32, what is seen past the figure.
+    """
+
+    alpha: Float32
+    trimap: UInt8 | None
+    box: Box
+    foreground: Float32
+    ground: Float32
 
 
 @dataclass(frozen=True)
@@ -224,30 +265,34 @@ class _Take:
     def make(self, frame: Frame, provenance: dict[str, str]) -> Figures:
         """Write a frame's products."""
         shown = self._shown(frame)
-        figure = self._figure(frame, shown.image)
-        if "trimap" in self.wanted:
+        figure = self._figure(frame, shown)
+        if figure.trimap is not None and "trimap" in self.wanted:
             write_png(self._file("trimap", frame), figure.trimap, provenance)
         if self.wanted == ("trimap",):
             return {}
-        ground = without_figure(shown.image, figure)
         hidden = figure.alpha >= HIDDEN
-        beta, unknown = self._beta(ground, hidden)
+        beta = self._beta(shown, figure, hidden)
+        unknown = np.isnan(beta)
+        unknown = np.asarray(unknown.any(axis=-1)) if beta.ndim == 3 else unknown
         figures: Figures = {
-            "unknown": int((unknown & ~hidden).sum()),
-            "hidden": int(hidden.sum()),
-            "not_finite": shown.bad,
+            "unknown": int(np.count_nonzero(unknown & ~hidden)),
+            "hidden": int(np.count_nonzero(hidden)),
+            "not_finite": 0 if shown.bad is None else int(np.count_nonzero(shown.bad)),
             "gain": round(shown.gain, 6),
         }
         marked = with_figures(provenance, figures)
         if "alpha" in self.wanted:
-            rgba = np.empty((*hidden.shape, 4), np.float16)
-            rgba[..., :3], rgba[..., 3] = to_half(figure.foreground), to_half(figure.alpha)
+            rgba = np.zeros((*hidden.shape, 4), np.float16)
+            rgba[figure.box][..., :3] = to_half(figure.foreground)
+            rgba[..., 3] = to_half(figure.alpha)
             write_exr(self._file("alpha", frame), {"RGBA": rgba}, shown.header, marked)
         if "beta" in self.wanted:
-            confidence = self.scene.confidence * (1 - figure.alpha)
+            confidence = self.scene.confidence.copy()
+            seen = 1 - figure.alpha[figure.box]
+            confidence[figure.box] = to_half(to_float(confidence[figure.box]) * seen)
             confidence[unknown] = 0
             name = "Y" if self.beta == "scalar" else "RGB"
-            layers = {name: to_half(beta), "confidence": to_half(confidence)}
+            layers = {name: to_half(self._filled(beta, hidden)), "confidence": confidence}
             write_exr(self._file("beta", frame), layers, shown.header, marked)
         return figures
 
@@ -268,22 +313,32 @@ class _Take:
 
     def _shown(self, frame: Frame) -> _Shown:
         stored = self.footage.image(frame)
-        image = to_float(stored.rgb(self.footage.transfer))
-        finite = np.isfinite(image)
-        bad = ~(finite[..., 0] & finite[..., 1] & finite[..., 2])
-        if bad.any():
-            image = np.where(bad[..., np.newaxis], np.float32(np.nan), image)
+        light = stored.rgb(self.footage.transfer)
+        seen = seen_pixels(light, None)
+        bad = None if seen is None else ~seen
         gain = 1.0
         if self.gain == "auto":
-            gain = frame_gain(on_grid(image, self.scene.step), self.scene.reference)
-        image = without_gain(image, gain).astype(np.float32, copy=False)
-        return _Shown(image, stored.header, gain, int(bad.sum()))
+            with np.errstate(invalid="ignore"):
+                gain = frame_gain(on_grid(light, self.scene.step), self.scene.reference)
+        return _Shown(light, stored.header, bad, gain)
 
-    def _figure(self, frame: Frame, image: Float32) -> Figure:
-        backdrop, unknown = self.scene.backdrop, self.scene.unknown
+    def _figure(self, frame: Frame, shown: _Shown) -> _Figure:
         if self.alpha is not None:
-            alpha = np.clip(_matte_plane(self.alpha.path(frame)), 0, 1)
-            return colour_figure(image, backdrop, unknown, alpha)
+            alpha = _matte_plane(self.alpha.path(frame))
+            box = around(alpha > 0, MARGIN) or _NONE
+            backdrop, unknown = self.scene.backdrop.at(box), self.scene.unknown[box]
+            image = shown.at(box)
+            figure = colour_figure(image, backdrop, unknown, alpha[box])
+            return _Figure(alpha, None, box, figure.foreground, without_figure(image, figure))
+        image = shown.at(Box(slice(None), slice(None)))
+        figure = self._pulled(frame, image)
+        box = around(figure.alpha > 0, 0) or _NONE
+        part = Figure(figure.foreground[box], figure.alpha[box], figure.trimap[box])
+        ground = without_figure(image[box], part)
+        return _Figure(figure.alpha, figure.trimap, box, part.foreground, ground)
+
+    def _pulled(self, frame: Frame, image: Float32) -> Figure:
+        backdrop, unknown = self.scene.backdrop, self.scene.unknown
         if self.keyframes is None:
             return pull_figure(image, backdrop, unknown)
         trimap = self.keyframes.trimap(frame)
@@ -291,25 +346,23 @@ class _Take:
             return pull_figure(image, backdrop, unknown, hint=trimap)
         return pull_figure(image, backdrop, unknown, trimap)._replace(trimap=trimap)
 
-    def _beta(self, image: Float32, hidden: Bool) -> tuple[Float32, Bool]:
-        """β (H, W) or (H, W, 3), filled, and where it was not measured."""
-        scene, plates = self.scene, self.scene.plates
-        if self.beta == "rgb":
-            coloured = shadow_beta.coloured_matte(image, plates.lit, plates.shadow)
-            planes = list(np.moveaxis(coloured, -1, 0))
-        else:
-            planes = [shadow_beta.shadow_matte(image, plates.lit, plates.shadow)]
-        filled = []
-        unknown = np.zeros(hidden.shape, bool)
-        for plane, contrast in zip(planes, scene.contrasts, strict=True):
-            known = np.where(scene.never_shaded | hidden, np.float32(np.nan), plane)
-            known = shadow_beta.without_noise(known, contrast)
-            known = np.clip(known, 0, 1) if self.clamp else known
-            unknown |= np.isnan(known)
-            filled.append(shadow_beta.fill_beta(known, scene.never_reached, hidden, self.fill))
-        return filled[0] if self.beta == "scalar" else np.stack(filled, axis=-1), unknown
+    def _beta(self, shown: _Shown, figure: _Figure, hidden: Bool) -> Float32:
+        """β (H, W) or (H, W, 3), NaN where it was not measured."""
+        unseen = hidden if shown.bad is None else hidden | shown.bad
+        ground = (figure.box, figure.ground)
+        return self.scene.gauge.measure(shown.light, unseen, shown.gain, ground, self.clamp)
+
+    def _filled(self, beta: Float32, hidden: Bool) -> Float32:
+        reached = self.scene.never_reached
+        if beta.ndim == 2:
+            return shadow_beta.fill_beta(beta, reached, hidden, self.fill)
+        planes = [beta[..., channel] for channel in range(3)]
+        return np.dstack([shadow_beta.fill_beta(p, reached, hidden, self.fill) for p in planes])
 
 
 def _matte_plane(path: Path) -> Float32:
+    """Alpha from a file, (H, W) float32 in [0, 1]; 0 where it is NaN."""
     plane = read_image(path).plane("A", "Y", "R")
-    return np.nan_to_num(plane, nan=0.0)
+    # Of NaN and a number fmax takes the number.
+    np.fmax(plane, 0, out=plane)
+    return np.minimum(plane, 1, out=plane)

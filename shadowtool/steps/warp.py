@@ -22,8 +22,8 @@ from shadowtool.core.warp_map import (
     sample,
 )
 from shadowtool.errors import OptionError, ReshootError
-from shadowtool.io.files import is_file, make_folder
-from shadowtool.io.image import EXR, Header, read_header, read_image, write_exr, write_png
+from shadowtool.io.files import is_file, make_folder, read_content
+from shadowtool.io.image import EXR, Header, Image, read_header, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, WARP, read_scan, read_warp, write_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_size
@@ -44,6 +44,8 @@ PICTURE = "warp.png"
 # Maps of which less of the frame is measured, or of which half is predicted to be off by more
 # pixels, are of no use.
 _LEAST_KNOWN, _WORST_ERROR = 0.05, 8.0
+# A file that takes up more than this part of its pixels' room holds grain.
+_GRAIN = 0.5
 
 
 def warp(
@@ -247,7 +249,8 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
             plain = image.rgb("none") if values.dtype.kind == "u" and values.ndim == 3 else values
             single = image.plane(name) if values.ndim == 2 else plain
             layers[name] = _warped(single, scaled, edge, values.dtype == np.float32)
-        write_exr(products(frame)[0], layers, image.header, provenance)
+        quick = _has_grain(image)
+        write_exr(products(frame)[0], layers, image.header, provenance, quick)
         return {}
 
     def sources(frame: Frame) -> list[Path]:
@@ -255,6 +258,12 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
 
     work = FrameWork(recipe, record_in, products, sources, [map_mark], make)
     return work.run(frames.present, run, frames.absent)
+
+
+def _has_grain(image: Image) -> bool:
+    """Whether a picture's own file could hardly make it smaller."""
+    stored = len(read_content(image.path).data)
+    return stored > _GRAIN * sum(values.nbytes for values in image.layers.values())
 
 
 def _warped(image: np.ndarray, places: np.ndarray, edge: float, single: bool) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shadowtool.core.beta import shadow_matte
+from shadowtool.core.beta import inverse_span, shadow_matte
 from shadowtool.core.compositing import shade
 from shadowtool.core.transfer import encode_srgb
 from shadowtool.core.warp_map import resample
@@ -83,7 +83,8 @@ def paper_maps(scene: str, frames: list[int], work: Path) -> Maps:
     own, target = (read_plates(work / name).plates for name in ("source", "target"))
     betas = {}
     for frame in frames:
-        projected = shadow_matte(load(frame_file_of(source, frame)), own.lit, own.shadow)
+        inverse = inverse_span(own.lit, own.shadow)
+        projected = shadow_matte(load(frame_file_of(source, frame)), own.shadow, inverse)
         betas[frame] = np.clip(np.nan_to_num(projected, nan=1.0), 0, 1)
     return Maps(target.lit, target.shadow, betas, paper_map(scene).warp)
 

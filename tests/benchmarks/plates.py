@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from shadowtool.core.beta import shadow_matte
+from shadowtool.core.beta import inverse_span, shadow_matte
 from shadowtool.core.transfer import encode_srgb
 from shadowtool.io.image import read_image, write_png
 from shadowtool.io.products import read_plates
@@ -87,7 +87,8 @@ def beta_figures(
     for frame in frames[::3]:
         if literal:
             image = load(frame_file_of(take, frame))
-            projected = shadow_matte(image, scene_plates.lit, scene_plates.shadow)
+            inverse = inverse_span(scene_plates.lit, scene_plates.shadow)
+            projected = shadow_matte(image, scene_plates.shadow, inverse)
             found = np.clip(np.nan_to_num(projected, nan=1.0), 0, 1)
         else:
             found = read_image(work / "matte" / "beta" / f"beta.{frame}.exr").plane("Y")

@@ -65,6 +65,10 @@ def contrast_of(lit: np.ndarray, shadow: np.ndarray) -> np.ndarray:
     return beta.shadow_contrast(Plates(lit, shadow), MODEL)
 
 
+def matte_of(image: np.ndarray, lit: np.ndarray, shadow: np.ndarray, kind="scalar") -> np.ndarray:
+    return beta.shadow_matte(image, shadow, beta.inverse_span(lit, shadow, kind), kind)
+
+
 def three(h, w):
     return st.tuples(picture(h, w), picture(h, w, TAME), picture(h, w, TAME))
 
@@ -142,15 +146,15 @@ CONTRACTS = {
         lambda r, s, lit: is_single(r, *s.shape) and (r >= 0).all() and (r[lit <= 0] == 1).all(),
     ),
     "shadow_matte": Contract(
-        beta.shadow_matte,
+        matte_of,
         three,
         lambda r, c, lit, s: (
             is_single(r, *lit.shape[:2])
-            and np.isnan(r[unknown(c) | ((lit - s) ** 2).sum(axis=-1).__eq__(0)]).all()
+            and not np.isfinite(r[unknown(c) | ((lit - s) ** 2).sum(axis=-1).__eq__(0)]).any()
         ),
     ),
     "β of L and S": Contract(
-        lambda lit, s: (beta.shadow_matte(lit, lit, s), beta.shadow_matte(s, lit, s)),
+        lambda lit, s: (matte_of(lit, lit, s), matte_of(s, lit, s)),
         lambda h, w: st.tuples(picture(h, w, TAME), picture(h, w, TAME)),
         lambda r, lit, s: (
             within(np.abs(r[0] - 1), 0, 1e-5)
@@ -158,11 +162,18 @@ CONTRACTS = {
             and np.array_equal(np.isnan(r[0]), np.isnan(r[1]))
         ),
     ),
-    "coloured_matte": Contract(
-        beta.coloured_matte,
+    "shadow_matte in each channel": Contract(
+        lambda c, lit, s: matte_of(c, lit, s, "rgb"),
         three,
         lambda r, c, lit, s: (
-            is_single(r, *lit.shape) and np.isnan(r[(lit == s) | ~np.isfinite(c)]).all()
+            is_single(r, *lit.shape) and not np.isfinite(r[(lit == s) | ~np.isfinite(c)]).any()
+        ),
+    ),
+    "shadow_matte of halfs": Contract(
+        lambda c, lit, s: matte_of(c, lit, s),
+        lambda h, w: st.tuples(halfs(h, w), picture(h, w, TAME), picture(h, w, TAME)),
+        lambda r, c, lit, s: (
+            np.array_equal(r, matte_of(c.astype(np.float32), lit, s), equal_nan=True)
         ),
     ),
     "shadow_contrast": Contract(
@@ -189,11 +200,23 @@ CONTRACTS = {
     ),
     "without_noise": Contract(
         beta.without_noise,
-        lambda h, w: st.tuples(plane(h, w, st.one_of(UNIT, st.just(np.nan))), plane(h, w)),
+        lambda h, w: st.tuples(plane(h, w, st.one_of(UNIT, st.just(np.nan))), plane(h, w, TAME)),
         lambda r, b, c: (
             is_single(r, *b.shape)
             and np.array_equal(np.isnan(r), np.isnan(b))
             and within(r, min(np.nanmin(b, initial=1), 1) - 1e-4, 1 + 1e-4)
+        ),
+    ),
+    "weight_of": Contract(
+        beta.weight_of,
+        lambda h, w: st.tuples(plane(h, w, st.one_of(TAME, st.just(np.nan)))),
+        lambda r, c: is_single(r, *c.shape) and (r >= 0).all() and (r[np.isnan(c)] == 0).all(),
+    ),
+    "confidence": Contract(
+        beta.confidence,
+        lambda h, w: st.tuples(plane(h, w, st.one_of(TAME, st.just(np.nan)))),
+        lambda r, c: (
+            r.dtype == np.float16 and within(r, 0, 1) and (r[~(c > 1)] == 0).all()
         ),
     ),
     "fill_beta": Contract(

@@ -24,6 +24,7 @@ from shadowtool.io.files import fingerprint
 from shadowtool.io.image import (
     Header,
     Image,
+    _ZipLevel,
     decode,
     read_header,
     read_image,
@@ -223,6 +224,8 @@ def test_quick_files_are_written_where_openexr_hides_the_setting(tmp_path, monke
         raise OSError
 
     monkeypatch.setattr("ctypes.CDLL", hidden)
+    # What it then takes the setting for must not outlive the test.
+    monkeypatch.setattr("shadowtool.io.image._zip_level", _ZipLevel())
     values = random(40, 30, 3)
     for quick in (True, False):
         write_exr(tmp_path / "a.exr", {"RGB": values}, quick=quick)

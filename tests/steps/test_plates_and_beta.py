@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from shadowtool.choices import Estimator
-from shadowtool.core.beta import shadow_matte
+from shadowtool.core.beta import inverse_span, shadow_matte
 from shadowtool.core.plates import ExtremePlates, Plates
 from shadowtool.errors import InputError
 from shadowtool.io.image import Header, Image, read_image, write_exr, write_png
@@ -383,7 +383,8 @@ def test_two_lights_add_up() -> None:
             extremes.add(frame)
         extremes.add(sky)
         plates = extremes.plates()
-        matted = [shadow_matte(frame, plates.lit, plates.shadow) for frame in alone]
+        inverse = inverse_span(plates.lit, plates.shadow)
+        matted = [shadow_matte(frame, plates.shadow, inverse) for frame in alone]
         chains.append((plates, matted))
     shadow = chains[0][0].shadow
     for index, truth in enumerate(both):

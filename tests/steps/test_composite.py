@@ -1,0 +1,71 @@
+"""Figure and shadow in the target scene, from files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shadowtool.core.compositing import over, shade
+from shadowtool.io.image import Header, read_image, write_exr, write_png
+from shadowtool.steps.composite import composite
+from tests.scene import Scene
+
+SCENE = Scene(60, 90)
+HEADER = Header(SCENE.width, SCENE.height)
+BETA = SCENE.disk(40, 30).astype(np.float16)
+
+
+def put(tmp_path: Path, figure: np.ndarray, suffix: str = ".exr") -> np.ndarray:
+    """The composite with this figure, (H, W, 4)."""
+    for part in ("plates", "matte/fg", "matte/beta"):
+        (tmp_path / part).mkdir(parents=True)
+    for name in ("lit", "shadow"):
+        write_exr(tmp_path / "plates" / f"{name}.exr", {"RGB": getattr(SCENE, name)}, HEADER)
+    write_exr(tmp_path / "matte" / "beta" / "beta.1001.exr", {"Y": BETA}, HEADER)
+    place = tmp_path / "matte" / "fg" / f"fg.1001{suffix}"
+    if suffix == ".png":
+        write_png(place, figure)
+    else:
+        write_exr(place, {"RGBA": figure}, HEADER)
+    composite(tmp_path / "matte", tmp_path / "out", plates=tmp_path / "plates")
+    return read_image(tmp_path / "out" / "out.1001.exr").layers["RGB"]
+
+
+def expected(figure: np.ndarray) -> np.ndarray:
+    behind = shade(SCENE.lit, SCENE.shadow, BETA.astype(np.float32))
+    single = figure.astype(np.float32)
+    return over(single[..., :3], single[..., 3], behind).astype(np.float16)
+
+
+def empty() -> np.ndarray:
+    return np.zeros((SCENE.height, SCENE.width, 4), np.float16)
+
+
+def spots() -> np.ndarray:
+    """Two small figures far apart, and light that hides nothing."""
+    figure = empty()
+    figure[3:6, 80:83] = (0.2, 0.3, 0.1, 0.5)
+    figure[50:55, 4:9] = (0.4, 0.4, 0.4, 1)
+    figure[40, 60] = (0, 0.25, 0, 0)
+    return figure
+
+
+@pytest.mark.parametrize("figure", [empty(), spots(), spots().astype(np.float32)])
+def test_every_pixel_is_figure_over_shaded_ground(tmp_path: Path, figure: np.ndarray) -> None:
+    assert np.array_equal(put(tmp_path, figure), expected(figure))
+
+
+def test_a_figure_that_is_no_number_is_nothing(tmp_path: Path) -> None:
+    figure = spots()
+    figure[52, 6, 1], figure[4, 81, 3], figure[20, 20, 0] = np.nan, np.inf, -np.inf
+    clean = spots()
+    clean[52, 6] = clean[4, 81] = clean[20, 20] = 0
+    assert np.array_equal(put(tmp_path, figure), expected(clean))
+
+
+def test_a_figure_of_code_values_is_found_too(tmp_path: Path) -> None:
+    codes = np.zeros((SCENE.height, SCENE.width, 4), np.uint8)
+    codes[30:40, 70:75] = 255
+    white = empty()
+    white[30:40, 70:75] = 1
+    assert put(tmp_path, codes, ".png") == pytest.approx(expected(white), abs=1e-3)

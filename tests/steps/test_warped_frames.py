@@ -1,0 +1,63 @@
+"""Frames seen through a map that is there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shadowtool.core.warp_map import WarpMap, identity_map
+from shadowtool.io.image import Header, read_image, write_exr
+from shadowtool.io.products import write_warp
+from shadowtool.steps.warp import warp
+
+WIDTH, HEIGHT = 64, 40
+HEADER = Header(WIDTH, HEIGHT)
+
+
+@pytest.fixture
+def identity(tmp_path: Path) -> Path:
+    found = WarpMap(identity_map(HEIGHT, WIDTH), np.zeros((HEIGHT, WIDTH), np.float32))
+    write_warp(tmp_path / "map.exr", found, HEADER, {})
+    return tmp_path / "map.exr"
+
+
+def grain() -> np.ndarray:
+    return np.random.default_rng(0).random((HEIGHT, WIDTH, 3)).astype(np.float16)
+
+
+def smooth() -> np.ndarray:
+    return np.full((HEIGHT, WIDTH, 3), 0.5, np.float16)
+
+
+@pytest.mark.parametrize("picture", [grain(), smooth()])
+def test_the_identity_leaves_all_as_it_is(
+    identity: Path, tmp_path: Path, picture: np.ndarray
+) -> None:
+    (tmp_path / "take").mkdir()
+    write_exr(tmp_path / "take" / "take.1001.exr", {"RGB": picture}, HEADER)
+    warp([], tmp_path / "out", map_file=identity, apply_to=tmp_path / "take")
+    found = read_image(tmp_path / "out" / "take" / "take.1001.exr").layers["RGB"]
+    assert found.dtype == np.float16
+    assert found == pytest.approx(picture, abs=1e-3)
+
+
+@pytest.mark.parametrize(("picture", "expected"), [(grain(), True), (smooth(), False)])
+def test_grain_is_written_without_a_long_search(
+    identity: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    picture: np.ndarray,
+    expected: bool,
+) -> None:
+    said: list[bool] = []
+
+    def write(path, channels, header, provenance, quick):
+        said.append(quick)
+        write_exr(path, channels, header, provenance, quick)
+
+    (tmp_path / "take").mkdir()
+    # Without attributes, which take up most of so small a file.
+    write_exr(tmp_path / "take" / "take.1001.exr", {"RGB": picture})
+    monkeypatch.setattr("shadowtool.steps.warp.write_exr", write)
+    warp([], tmp_path / "out", map_file=identity, apply_to=tmp_path / "take")
+    assert said == [expected]

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.backdrop import Backdrop, Nearest
+from shadowtool.core.backdrop import Backdrop, Nearest, Places
+from shadowtool.core.filling import fill_membrane
 from shadowtool.core.trimap import BACKGROUND, FIGURE
 
 Float32 = NDArray[np.float32]
@@ -37,6 +38,11 @@ _OFF_LINE2 = 12.0
 # Of normal noise 9 pixels in 10 are within this distance of the line, in two dimensions.
 _NINE_TENTHS = 2.15
 _LARGEST_ERROR, _LEAST_SAMPLE = 3.0, 100
+# In and around a figure, this many times its edges' reach, there may be shadow where ground so many
+# times that far away is in it. Elsewhere the light is that of the ground around, give or take, or a
+# shadow costs as much as this squared distance.
+_RING, _NO_SHADOW, _LIT = 2, 4, 0.8
+_LIGHT, _NO_SHADOW2 = 0.1, 8.0
 # What is so many pixels from the figure has nothing of it; beside it begins sooner.
 _AWAY, _BESIDE = 5, 1
 # A figure is at least this part of the picture, a hole in it at least that; neither is but a few
@@ -70,6 +76,7 @@ def find_figure(
     unknown: Bool,
     hint: UInt8,
     frame_size: int,
+    reach: int,
 ) -> Found:
     """The figure in a frame, or in a part of it.
 
@@ -79,6 +86,7 @@ def find_figure(
         unknown: (H, W), nothing can be said of the pixel.
         hint: (H, W) uint8, a trimap that may be a little off; 128 says nothing.
         frame_size: how many pixels the whole frame has.
+        reach: how far from the figure's edge it may at first be missed, pixels.
     """
     other = texture_evidence(image, backdrop)
     other[unknown] = 0
@@ -97,16 +105,44 @@ def find_figure(
         figure[edge & (distance2 > _OFF_LINE2)] = 1
         return _solid(figure, frame_size)
 
-    distance2 = nearest.distance2
+    mask = mask_of(nearest.distance2)
+    if not mask.any():
+        return Found(mask, mask)
+    distance2 = nearest.distance2 / _background_error(nearest, mask) ** 2
+    ring, shadow2 = _without_shadow(image, backdrop, nearest, mask, unknown, reach)
+    distance2[ring] = np.minimum(distance2[ring] + np.float32(_NO_SHADOW2), shadow2)
     mask = mask_of(distance2)
-    error = _background_error(nearest, mask)
-    if (error > 1).any():
-        distance2 = distance2 / error**2
-        mask = mask_of(distance2)
     # What is thinner than three pixels is no limb.
     limbs = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
     strands = (distance2 > _OFF_LINE2) & (nearest.from_lit2 > _OFF_LINE2) & ~unknown
     return Found(limbs, _connected(mask | strands, limbs))
+
+
+def _without_shadow(
+    image: Float32,
+    backdrop: Backdrop,
+    nearest: Nearest,
+    mask: Bool,
+    unknown: Bool,
+    reach: int,
+) -> tuple[Places, Float32]:
+    """Pixels in and around a figure that have no shadow near them, and their squared distance (N)
+    in standard deviations from the background in the light that is seen around them."""
+    size = 2 * _RING * reach + 1
+    ring = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    seen = ~(ring | unknown)
+    known = np.where(seen, nearest.beta, np.float32(0))[..., np.newaxis]
+    beta = fill_membrane(known, seen.astype(np.float32))[..., 0]
+    size = 2 * _NO_SHADOW * reach + 1
+    darkest = cv2.erode(beta, np.ones((size, size), np.uint8))
+    places = np.nonzero(ring & (darkest > _LIT))
+    here, value = backdrop.at(places), image[places]
+    weight = 1 / here.variance(value)
+    off, shift = value - here.under(beta[places]), here.lit - here.shadow
+    # β may be off by so much: rank one more in the covariance.
+    along = (weight * off * shift).sum(axis=-1) ** 2
+    along /= (weight * shift**2).sum(axis=-1) + np.float32(1 / _LIGHT**2)
+    return places, np.asarray((weight * off**2).sum(axis=-1) - along, np.float32)
 
 
 def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:

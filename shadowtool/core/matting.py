@@ -76,20 +76,20 @@ def pull_figure(
     box = _around(changed(seen, backdrop) | (trimap == FIGURE))
     if box is None:
         return Figure(foreground, alpha, trimap)
-    reach = max(_REACH, round(_REACH_PART * width))
+    reach = _reach(width)
     part, ground = seen[box], backdrop.at(box)
     nearest = ground.nearest(part)
     hint = drawn if hint is None else hint
-    found = find_figure(part, ground, nearest, unknown[box], hint[box], height * width)
+    found = find_figure(part, ground, nearest, unknown[box], hint[box], height * width, reach)
     found = _within(found, drawn[box])
     wide = wide_trimap(found.mask, found.maybe, reach)
     wide = np.where(drawn[box] == UNKNOWN, wide, drawn[box])
     behind = ground_beta(nearest.beta, (wide == BACKGROUND) & ~unknown[box])
-    first = solve(part, wide, behind, ground)
+    first = solve(part, wide, behind, ground, reach)
     prior = edge_prior(first.alpha, first.error, first.misfit, wide, found.mask, reach)
     narrow = narrowed(wide, prior, found.mask)
     prior = doubted(prior, nearest.distance2)
-    solved = solve(part, narrow, behind, ground, prior)
+    solved = solve(part, narrow, behind, ground, reach, prior)
     whole = np.where(solved.alpha > 1 - _NOTHING, np.float32(1), solved.alpha)
     alpha[box] = np.where(whole < _NOTHING, np.float32(0), whole)
     foreground[box] = alpha[box][..., np.newaxis] * solved.foreground
@@ -113,7 +113,8 @@ def colour_figure(image: Float32, backdrop: Backdrop, unknown: Bool, alpha: Floa
         part, ground = seen[box], backdrop.at(box)
         seen_ground = (alpha[box] == 0) & ~unknown[box]
         behind = ground_beta(ground.nearest(part).beta, seen_ground)
-        foreground[box] = alpha[box][..., np.newaxis] * colours(part, alpha[box], behind, ground)
+        found = colours(part, alpha[box], behind, ground, _reach(width))
+        foreground[box] = alpha[box][..., np.newaxis] * found
         foreground[bad] = 0
     return Figure(foreground, alpha, np.asarray(trimap, np.uint8))
 
@@ -126,6 +127,11 @@ def without_figure(image: Float32, figure: Figure) -> Float32:
     left = 1 - figure.alpha[edge][:, np.newaxis]
     ground[edge] = (image[edge] - figure.foreground[edge]) / left
     return ground
+
+
+def _reach(width: int) -> int:
+    """How far edges are looked for inwards, pixels."""
+    return max(_REACH, round(_REACH_PART * width))
 
 
 def _without_unknown(

@@ -7,11 +7,12 @@ from shadowtool.core.detection import Found, changed, find_figure, texture_evide
 from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
 from tests.figures import BACKDROP, DARK, KNOWN, SCENE, disk, shot, strand
 
+REACH = 4
 NOTHING = np.full(KNOWN.shape, UNKNOWN, np.uint8)
 
 
 def found_in(image: np.ndarray, backdrop: Backdrop = BACKDROP, hint: np.ndarray = NOTHING) -> Found:
-    return find_figure(image, backdrop, backdrop.nearest(image), KNOWN, hint, KNOWN.size)
+    return find_figure(image, backdrop, backdrop.nearest(image), KNOWN, hint, KNOWN.size, REACH)
 
 
 @pytest.mark.parametrize("soft", [1, 6, 40])
@@ -45,6 +46,21 @@ def test_dark_clothes_in_shadow_are_told_from_it_by_the_texture_that_they_hide()
     assert not mask[disk(70, 50, 22) == 0].any()
 
 
+@pytest.mark.parametrize("near", [False, True])
+def test_what_looks_like_shadow_is_figure_where_there_is_none_around(near: bool) -> None:
+    # The rim of the figure looks nearly like ground in shadow, which has no texture that would tell.
+    alpha = disk(70, 50, 20)
+    even = np.full_like(SCENE.lit, 0.5)
+    backdrop = Backdrop(even, even / 4, BACKDROP.noise, BACKDROP.doubt)
+    rim = (alpha == 1) & (disk(67, 50, 18) == 0)
+    image = np.where(alpha[..., None] == 1, np.float32([0.05, 0.1, 0.6]), even)
+    image[rim] = [0.21, 0.2, 0.195]
+    if near:
+        image[SCENE.disk(110, 50, radius=12) < 0.5] = 0.125
+    mask = found_in(SCENE.noisy(image, 1), backdrop).mask
+    assert (mask[rim].mean() > 0.95) != near
+
+
 def test_a_hair_hangs_on_the_head() -> None:
     head = disk(60, 60, 16)
     hair = strand((60, 60), (110, 20), 0.8)
@@ -67,7 +83,9 @@ def test_pixels_of_which_nothing_is_known_follow_their_neighbours() -> None:
     unknown[48:52, 68:72] = unknown[10:14, 10:14] = True
     image = shot(alpha).image
     image[unknown] = 0
-    mask = find_figure(image, BACKDROP, BACKDROP.nearest(image), unknown, NOTHING, KNOWN.size).mask
+    mask = find_figure(
+        image, BACKDROP, BACKDROP.nearest(image), unknown, NOTHING, KNOWN.size, REACH
+    ).mask
     assert mask[48:52, 68:72].all() and not mask[10:14, 10:14].any()
 
 

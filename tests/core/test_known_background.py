@@ -3,9 +3,10 @@ import pytest
 
 from shadowtool.core.known_background import colours, ground_beta, solve
 from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN, Prior
-from tests.figures import BACKDROP, BLUE, KNOWN, NOISE, SCENE, Shot, disk, shot
+from tests.figures import BACKDROP, BLUE, COLUMNS, KNOWN, NOISE, ROWS, SCENE, Shot, disk, shot
 
 DISK = disk(70, 50, 20)
+REACH = 4
 SHADE = SCENE.disk(95, 50, radius=30, soft=8)
 
 
@@ -47,7 +48,7 @@ def test_alpha_is_that_which_a_search_finds(true: float) -> None:
     trimap = np.where(alpha == 1, FIGURE, BACKGROUND).astype(np.uint8)
     trimap[50, 91] = UNKNOWN
     lit = np.ones_like(SHADE)
-    found = solve(given.image, trimap, lit, BACKDROP).alpha[50, 91]
+    found = solve(given.image, trimap, lit, BACKDROP, REACH).alpha[50, 91]
     expected, _ = searched(
         given.image[50, 91],
         given.foreground[50, 89],
@@ -62,7 +63,7 @@ def test_alpha_is_that_which_a_search_finds(true: float) -> None:
 def test_alpha_in_light_in_shadow_and_across_its_edge(beta: np.ndarray | None) -> None:
     given = shot(DISK, beta)
     trimap = trimap_of(DISK)
-    found = solve(given.image, trimap, behind(given, trimap), BACKDROP)
+    found = solve(given.image, trimap, behind(given, trimap), BACKDROP, REACH)
     assert np.abs(found.alpha - DISK)[trimap == UNKNOWN].mean() < 0.03
     assert (found.alpha[trimap == FIGURE] == 1).all()
     assert (found.alpha[trimap == BACKGROUND] == 0).all()
@@ -71,9 +72,9 @@ def test_alpha_in_light_in_shadow_and_across_its_edge(beta: np.ndarray | None) -
 def test_many_pixels_are_solved_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
     given = shot(DISK, SHADE)
     trimap = trimap_of(DISK)
-    whole = solve(given.image, trimap, behind(given, trimap), BACKDROP)
+    whole = solve(given.image, trimap, behind(given, trimap), BACKDROP, REACH)
     monkeypatch.setattr("shadowtool.core.known_background._BLOCK", 7)
-    parts = solve(given.image, trimap, behind(given, trimap), BACKDROP)
+    parts = solve(given.image, trimap, behind(given, trimap), BACKDROP, REACH)
     for one, other in zip(whole, parts, strict=True):
         assert one == pytest.approx(other, abs=1e-5)
 
@@ -81,7 +82,7 @@ def test_many_pixels_are_solved_as_few_are(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_error_that_it_predicts_is_the_one_it_makes() -> None:
     given = shot(DISK, SHADE)
     trimap = trimap_of(DISK)
-    found = solve(given.image, trimap, behind(given, trimap), BACKDROP)
+    found = solve(given.image, trimap, behind(given, trimap), BACKDROP, REACH)
     mixed = (DISK > 0.05) & (DISK < 0.95)
     off = (found.alpha - DISK)[mixed] / np.maximum(found.error[mixed], 0.01)
     assert np.mean(np.abs(off) < 3) > 0.9
@@ -95,16 +96,48 @@ def test_a_prior_decides_where_the_figure_looks_like_the_ground() -> None:
     ones = np.ones_like(SHADE)
     for expected in (0.2, 0.9):
         prior = Prior(np.float32(expected) * ones, np.float32(0.05) * ones)
-        found = solve(even, trimap, ones, backdrop, prior)
-        assert found.alpha[trimap == UNKNOWN] == pytest.approx(expected, abs=0.02)
+        found = solve(even, trimap, ones, backdrop, REACH, prior)
+        assert found.alpha[trimap == UNKNOWN] == pytest.approx(expected, abs=0.15)
+
+
+@pytest.mark.parametrize("given_prior", [False, True])
+def test_light_on_the_figure_may_change_towards_its_rim(given_prior: bool) -> None:
+    given = shot(DISK, SHADE)
+    inwards = np.clip((20.5 - np.hypot(COLUMNS - 70, ROWS - 50)) / 3, 0, 1)[..., None]
+    # With a prior the shade that ground has is thought of too.
+    least = SCENE.shadow / SCENE.lit if given_prior else 0.6
+    figure = given.foreground * (least + (1 - least) * inwards)
+    image = SCENE.noisy(DISK[..., None] * figure + (1 - DISK[..., None]) * given.background, 1)
+    trimap = trimap_of(DISK, 2)
+    prior = Prior(0 * DISK.astype(np.float32) + 0.5, np.full(DISK.shape, 0.3, np.float32))
+    ground = behind(given, trimap)
+    found = solve(image, trimap, ground, BACKDROP, REACH, prior if given_prior else None)
+    assert np.abs(found.alpha - DISK)[trimap == UNKNOWN].mean() < 0.03
+
+
+def test_a_sliver_of_shadow_at_a_sole_is_ground_though_ground_around_is_lit() -> None:
+    sliver = (np.abs(ROWS - 71) <= 1) & (np.abs(COLUMNS - 68) <= 6)
+    shadow = SCENE.disk(82, 74, radius=8, soft=1)
+    given = shot(DISK, np.where(sliver & (DISK == 0), 0, shadow))
+    trimap = trimap_of(DISK)
+    trimap[sliver & (DISK < 1)] = UNKNOWN
+    prior = Prior(np.full(DISK.shape, 0.8, np.float32), np.full(DISK.shape, 0.15, np.float32))
+    lit = ground_beta(shadow, trimap == BACKGROUND)
+    found = solve(given.image, trimap, lit, BACKDROP, REACH, prior)
+    taken = sliver & (DISK == 0)
+    assert lit[taken].mean() > 0.7
+    assert np.median(found.alpha[taken]) < 0.1
+    # Far from any shadow the same is dark clothes.
+    alone = solve(given.image, trimap, np.ones_like(lit), BACKDROP, REACH, prior)
+    assert np.median(alone.alpha[taken]) > 0.5
 
 
 def test_colours_have_nothing_of_the_ground() -> None:
     given = shot(DISK, SHADE)
     trimap = trimap_of(DISK)
     for foreground in (
-        solve(given.image, trimap, behind(given, trimap), BACKDROP).foreground,
-        colours(given.image, given.alpha, behind(given, trimap), BACKDROP),
+        solve(given.image, trimap, behind(given, trimap), BACKDROP, REACH).foreground,
+        colours(given.image, given.alpha, behind(given, trimap), BACKDROP, REACH),
     ):
         rim = (DISK > 0.3) & (DISK < 1)
         assert np.abs(foreground - given.foreground)[rim].mean() < 0.02
@@ -113,14 +146,14 @@ def test_colours_have_nothing_of_the_ground() -> None:
 
 def test_colours_of_a_figure_that_is_nowhere_opaque() -> None:
     given = shot(0.5 * DISK)
-    found = colours(given.image, given.alpha, np.ones_like(SHADE), BACKDROP)
+    found = colours(given.image, given.alpha, np.ones_like(SHADE), BACKDROP, REACH)
     assert np.isfinite(found).all() and (found[DISK == 0] == 0).all()
 
 
 @pytest.mark.parametrize("value", [BACKGROUND, UNKNOWN])
 def test_without_a_part_that_is_sure_there_is_no_figure(value: int) -> None:
     trimap = np.full(KNOWN.shape, value, np.uint8)
-    found = solve(SCENE.lit, trimap, np.ones_like(SHADE), BACKDROP)
+    found = solve(SCENE.lit, trimap, np.ones_like(SHADE), BACKDROP, REACH)
     assert (found.alpha == 0).all() and (found.foreground == 0).all()
 
 

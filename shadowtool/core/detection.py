@@ -39,9 +39,9 @@ _OFF_LINE2 = 12.0
 _NINE_TENTHS = 2.15
 _LARGEST_ERROR, _LEAST_SAMPLE = 3.0, 100
 # In and around a figure, this many times its edges' reach, there may be shadow where ground so many
-# times that far away is in it. Elsewhere the light is that of the ground around, give or take, or a
-# shadow costs as much as this squared distance.
-_RING, _NO_SHADOW, _LIT = 2, 4, 0.8
+# times that far away is in it, or below the second β beside the figure. Elsewhere the light is that
+# of the ground around, give or take, or a shadow costs as much as this squared distance.
+_RING, _NO_SHADOW, _LIT, _FULL = 2, 5, 0.8, 0.15
 _LIGHT, _NO_SHADOW2 = 0.1, 8.0
 # What is so many pixels from the figure has nothing of it; beside it begins sooner.
 _AWAY, _BESIDE = 5, 1
@@ -133,8 +133,11 @@ def _without_shadow(
     seen = ~(ring | unknown)
     known = np.where(seen, nearest.beta, np.float32(0))[..., np.newaxis]
     beta = fill_membrane(known, seen.astype(np.float32))[..., 0]
+    full = (nearest.beta < _FULL) & (nearest.distance2 < _OFF_LINE2) & ~mask & ~unknown
+    full = cv2.morphologyEx(full.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
     size = 2 * _NO_SHADOW * reach + 1
-    darkest = cv2.erode(beta, np.ones((size, size), np.uint8))
+    darkest = np.where(full, np.float32(0), beta)
+    darkest = cv2.erode(darkest, np.ones((size, size), np.uint8))
     places = np.nonzero(ring & (darkest > _LIT))
     here, value = backdrop.at(places), image[places]
     weight = 1 / here.variance(value)

@@ -36,10 +36,10 @@ _OWN_COLOUR = 0.6
 # How far β is from that of the ground around where that is even.
 _BETA = 0.02
 # There may be shadow that is only seen so many times the edges' reach away. How rare that is, as is
-# a figure in its own shade: exp(-this); and what alpha then is expected to be: means, deviations.
-_UNSEEN_REACHES = 3
-_RARE = 2.0
-_TOLD = ((0.0, 0.5), (0.3, 1.0))
+# a figure in its own shade: exp(-the second).
+_UNSEEN_REACHES, _RARE = 5, 2.0
+# Alpha is then below the first, or off from what is expected by the second.
+_IN_SHADOW, _IN_SHADE = 0.3, 0.5
 # Within so many pixels β is looked at for evenness.
 _EVEN_RADIUS = 4
 # What near parts of the figure are tried: the nearest, and those nearest to places (down, right)
@@ -110,14 +110,13 @@ def solve(
     around = _around(solid, behind, None if prior is None else reach)
     for part in _blocks(trimap == UNKNOWN):
         pixels = _gather(image, part, around, backdrop)
-        expected = np.full(pixels.far.shape, 0.5, np.float32), np.full_like(pixels.far, 3)
+        mean, deviation = np.full_like(pixels.far, 0.5), np.full_like(pixels.far, 3)
         if prior is not None:
-            for values, known, told in zip(
-                expected, (prior.mean, prior.deviation), _TOLD, strict=True
-            ):
-                values[:] = known[part][:, np.newaxis]
-                values[:, -2:] = told
-        alpha[part], error[part], misfit[part], share = _most_probable(pixels, *expected)
+            mean[:] = prior.mean[part][:, np.newaxis]
+            deviation[:] = prior.deviation[part][:, np.newaxis]
+            mean[:, -2], deviation[:, -2] = 0, _IN_SHADOW
+            deviation[:, -1] = np.maximum(deviation[:, -1], np.float32(_IN_SHADE))
+        alpha[part], error[part], misfit[part], share = _most_probable(pixels, mean, deviation)
         foreground[part] = _colour(pixels, alpha[part], error[part], share).T
     return Solved(alpha, np.maximum(foreground, 0), error, misfit)
 

@@ -35,6 +35,8 @@ _STEP, _LEAST_TEXTURE = 0.2, 0.03
 _SHARING, _LIKE, _GUIDE_POWER = 20.0, 10.0, 0.3
 # A pixel at the figure's edge, or connected with it, that is so far off the line is not background.
 _OFF_LINE2 = 12.0
+# One that is no further from L is not figure, whatever its neighbours are: gaps are narrow.
+_ON_LIT2 = 9.0
 # Of normal noise 9 pixels in 10 are within this distance of the line, in two dimensions.
 _NINE_TENTHS = 2.15
 _LARGEST_ERROR, _LEAST_SAMPLE = 3.0, 100
@@ -103,6 +105,7 @@ def find_figure(
         square = np.ones((3, 3), np.uint8)
         edge = (cv2.dilate(figure, square) > 0) & (cv2.erode(figure, square) == 0)
         figure[edge & (distance2 > _OFF_LINE2)] = 1
+        figure[(nearest.from_lit2 < _ON_LIT2) & (hint != FIGURE) & ~unknown] = 0
         return _solid(figure, frame_size)
 
     mask = mask_of(nearest.distance2)

@@ -68,6 +68,15 @@ def test_a_hair_hangs_on_the_head() -> None:
     assert found.maybe[middle].mean() > 0.95
 
 
+def test_ground_is_seen_through_a_narrow_gap() -> None:
+    alpha = disk(70, 50, 20)
+    alpha[50:75, 64:66] = 0
+    # In about the ground's colour evidence is shared across the gap.
+    mask = found_in(shot(alpha, colour=np.float32([0.5, 0.45, 0.5])).image).mask
+    assert mask[50:65, 64:66].mean() < 0.1
+    assert mask[alpha == 1].mean() > 0.99
+
+
 def test_specks_are_no_figure_and_a_pinhole_is_none_in_it() -> None:
     alpha = disk(70, 50, 20)
     alpha[10, 10], alpha[50, 70] = 1, 0

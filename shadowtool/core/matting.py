@@ -76,7 +76,7 @@ def pull_figure(
     box = _around(changed(seen, backdrop) | (trimap == FIGURE))
     if box is None:
         return Figure(foreground, alpha, trimap)
-    reach = _reach(width)
+    reach = max(_REACH, round(_REACH_PART * width))
     part, ground = seen[box], backdrop.at(box)
     nearest = ground.nearest(part)
     hint = drawn if hint is None else hint
@@ -113,8 +113,8 @@ def colour_figure(image: Float32, backdrop: Backdrop, unknown: Bool, alpha: Floa
         part, ground = seen[box], backdrop.at(box)
         seen_ground = (alpha[box] == 0) & ~unknown[box]
         behind = ground_beta(ground.nearest(part).beta, seen_ground)
-        found = colours(part, alpha[box], behind, ground, _reach(width))
-        foreground[box] = alpha[box][..., np.newaxis] * found
+        colour = colours(part, alpha[box], behind, ground, _REACH)
+        foreground[box] = alpha[box][..., np.newaxis] * colour
         foreground[bad] = 0
     return Figure(foreground, alpha, np.asarray(trimap, np.uint8))
 
@@ -127,11 +127,6 @@ def without_figure(image: Float32, figure: Figure) -> Float32:
     left = 1 - figure.alpha[edge][:, np.newaxis]
     ground[edge] = (image[edge] - figure.foreground[edge]) / left
     return ground
-
-
-def _reach(width: int) -> int:
-    """How far edges are looked for inwards, pixels."""
-    return max(_REACH, round(_REACH_PART * width))
 
 
 def _without_unknown(

@@ -87,7 +87,7 @@ def edge_prior(
     usable = (trimap == UNKNOWN) & (error < _EXACT) & (misfit < _EXPLAINED)
     mean = np.where(layer > 0, np.float32(1), np.float32(0))
     deviation = np.full(mask.shape, _LEAST_DEVIATION, np.float32)
-    here = {}
+    elsewhere = {}
     for number in range(-1, reach + 2):
         own = layer == number
         sample = alpha[own & usable]
@@ -98,13 +98,16 @@ def edge_prior(
             expected, scatter = _SHARP.get(number, (float(number > 0), 0.0))
         mean[own] = expected
         deviation[own] = max(scatter, _LEAST_DEVIATION)
-        if number > 0:
-            here[number] = _along_edge(alpha, own & usable, expected)
+        elsewhere[number] = expected
+
+    def along(number: int) -> Float32:
+        return _along_edge(alpha, (layer == number) & usable, elsewhere[number])
+
     # Over a blurred edge alpha rises from layer to layer; that of another colour jumps.
-    rises = here[1] < _RISE * here[3]
-    for number, found in here.items():
-        own = layer == number
-        blurred = own & rises & (found < _BLURRED * mean)
+    rises = along(1) < _RISE * along(3)
+    for number in range(1, reach + 2):
+        found = along(number)
+        blurred = (layer == number) & rises & (found < _BLURRED * mean)
         mean[blurred] = found[blurred]
         deviation[blurred] = _BLURRED_DEVIATION
     loose = (trimap == UNKNOWN) & (layer < -1)

@@ -50,21 +50,31 @@ _ROUNDS = 2
 _BLOCK = 1 << 16
 
 
-class Solved(NamedTuple):
-    """A figure's matte and colour.
+class Measured(NamedTuple):
+    """What a frame by itself tells of a figure's matte.
 
     Attributes:
         alpha: (H, W) float32 in [0, 1].
-        foreground: (H, W, 3) float32 ≥ 0, F where alpha is above 0, not premultiplied.
         error: (H, W) float32, standard deviation of alpha where the trimap is unknown, else 0.
         misfit: (H, W) float32, squared distance of C from its explanation in standard deviations,
             where the trimap is unknown, else 0.
     """
 
     alpha: Float32
-    foreground: Float32
     error: Float32
     misfit: Float32
+
+
+class Solved(NamedTuple):
+    """A figure's matte and colour.
+
+    Attributes:
+        alpha: (H, W) float32 in [0, 1].
+        foreground: (H, W, 3) float32 ≥ 0, F where alpha is above 0, not premultiplied.
+    """
+
+    alpha: Float32
+    foreground: Float32
 
 
 def ground_beta(beta: Float32, ground: Bool) -> Float32:
@@ -83,42 +93,58 @@ def ground_beta(beta: Float32, ground: Bool) -> Float32:
     return fill_membrane(known, ground.astype(np.float32))[..., 0]
 
 
-def solve(
-    image: Float32,
-    trimap: UInt8,
-    behind: Float32,
-    backdrop: Backdrop,
-    reach: int,
-    prior: Prior | None = None,
-) -> Solved:
-    """Alpha and F where a trimap is unknown.
+def measure(image: Float32, trimap: UInt8, behind: Float32, backdrop: Backdrop) -> Measured:
+    """Alpha where a trimap is unknown, if all of [0, 1] is as likely.
 
     Args:
         image: (H, W, 3) float32, linear light, without NaN.
         trimap: (H, W) uint8; 0 and 255 are kept as they are. Without any 255 all is background:
             there is no figure to mix with.
         behind: (H, W), β from `ground_beta`.
-        reach: how far the figure's edges go, pixels; shadow is looked for in this measure.
-        prior: of alpha; None if all of [0, 1] is as likely.
     """
-    alpha = np.where(trimap == FIGURE, np.float32(1), np.float32(0))
-    foreground = image * alpha[..., np.newaxis]
-    error, misfit = np.zeros_like(alpha), np.zeros_like(alpha)
     solid = trimap == FIGURE
+    alpha = solid.astype(np.float32)
+    error, misfit = np.zeros_like(alpha), np.zeros_like(alpha)
     if not solid.any():
-        return Solved(alpha, foreground, error, misfit)
-    around = _around(solid, behind, None if prior is None else reach)
+        return Measured(alpha, error, misfit)
+    around = _around(solid, behind, None)
     for part in _blocks(trimap == UNKNOWN):
         pixels = _gather(image, part, around, backdrop)
         mean, deviation = np.full_like(pixels.far, 0.5), np.full_like(pixels.far, 3)
-        if prior is not None:
-            mean[:] = prior.mean[part][:, np.newaxis]
-            deviation[:] = prior.deviation[part][:, np.newaxis]
-            mean[:, -2], deviation[:, -2] = 0, _IN_SHADOW
-            deviation[:, -1] = np.maximum(deviation[:, -1], np.float32(_IN_SHADE))
-        alpha[part], error[part], misfit[part], share = _most_probable(pixels, mean, deviation)
-        foreground[part] = _colour(pixels, alpha[part], error[part], share).T
-    return Solved(alpha, np.maximum(foreground, 0), error, misfit)
+        alpha[part], error[part], misfit[part], _ = _most_probable(pixels, mean, deviation)
+    return Measured(alpha, error, misfit)
+
+
+def solve(
+    image: Float32,
+    trimap: UInt8,
+    behind: Float32,
+    backdrop: Backdrop,
+    reach: int,
+    prior: Prior,
+) -> Solved:
+    """Alpha and F where a trimap is unknown; arguments as for `measure`.
+
+    Args:
+        reach: how far the figure's edges go, pixels; shadow is looked for in this measure.
+        prior: of alpha.
+    """
+    solid = trimap == FIGURE
+    alpha = solid.astype(np.float32)
+    foreground = image * alpha[..., np.newaxis]
+    if not solid.any():
+        return Solved(alpha, foreground)
+    around = _around(solid, behind, reach)
+    for part in _blocks(trimap == UNKNOWN):
+        pixels = _gather(image, part, around, backdrop)
+        mean, deviation = np.empty_like(pixels.far), np.empty_like(pixels.far)
+        mean[:] = prior.mean[part][:, np.newaxis]
+        deviation[:] = prior.deviation[part][:, np.newaxis]
+        mean[:, -2], deviation[:, -2] = 0, _IN_SHADOW
+        deviation[:, -1] = np.maximum(deviation[:, -1], np.float32(_IN_SHADE))
+        alpha[part], error, _, share = _most_probable(pixels, mean, deviation)
+        foreground[part] = _colour(pixels, alpha[part], error, share).T
+    return Solved(alpha, np.maximum(foreground, 0, out=foreground))
 
 
 def colours(
@@ -140,7 +166,7 @@ def colours(
         sure = np.full_like(pixels.far, 1e-3)
         *_, share = _most_probable(pixels, given[:, np.newaxis], sure)
         foreground[part] = _colour(pixels, given, np.zeros_like(given), share).T
-    return np.maximum(foreground, 0)
+    return np.maximum(foreground, 0, out=foreground)
 
 
 def _blocks(mask: Bool) -> Iterator[Places]:

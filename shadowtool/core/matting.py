@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.detection import Found, changed, find_figure
-from shadowtool.core.known_background import colours, ground_beta, solve
+from shadowtool.core.known_background import colours, ground_beta, measure, solve
 from shadowtool.core.trimap import (
     BACKGROUND,
     FIGURE,
@@ -85,14 +85,13 @@ def pull_figure(
     wide = wide_trimap(found.mask, found.maybe, reach)
     wide = np.where(drawn[box] == UNKNOWN, wide, drawn[box])
     behind = ground_beta(nearest.beta, (wide == BACKGROUND) & ~unknown[box])
-    first = solve(part, wide, behind, ground, reach)
-    prior = edge_prior(first.alpha, first.error, first.misfit, wide, found.mask, reach)
+    prior = edge_prior(*measure(part, wide, behind, ground), wide, found.mask, reach)
     narrow = narrowed(wide, prior, found.mask)
     prior = doubted(prior, nearest.distance2)
     solved = solve(part, narrow, behind, ground, reach, prior)
     whole = np.where(solved.alpha > 1 - _NOTHING, np.float32(1), solved.alpha)
     alpha[box] = np.where(whole < _NOTHING, np.float32(0), whole)
-    foreground[box] = alpha[box][..., np.newaxis] * solved.foreground
+    np.multiply(alpha[box][..., np.newaxis], solved.foreground, out=foreground[box])
     foreground[bad] = 0
     trimap[box] = narrow
     return Figure(foreground, alpha, trimap)

@@ -58,10 +58,12 @@ class Found(NamedTuple):
     Attributes:
         mask: (H, W) bool, most of the pixel shows the figure; nothing thin.
         maybe: (H, W) bool, mask and what hangs on it that is not background, strands above all.
+        excess: by how much more than noise the ground is off its line, where it is most so; ≥ 1.
     """
 
     mask: Bool
     maybe: Bool
+    excess: float
 
 
 def changed(image: Float32, backdrop: Backdrop) -> Bool:
@@ -110,15 +112,16 @@ def find_figure(
 
     mask = mask_of(nearest.distance2)
     if not mask.any():
-        return Found(mask, mask)
-    distance2 = nearest.distance2 / _background_error(nearest, mask) ** 2
+        return Found(mask, mask, 1.0)
+    excess = _background_error(nearest, mask)
+    distance2 = nearest.distance2 / excess**2
     ring, shadow2 = _without_shadow(image, backdrop, nearest, mask, unknown, reach)
     distance2[ring] = np.minimum(distance2[ring] + np.float32(_NO_SHADOW2), shadow2)
     mask = mask_of(distance2)
     # What is thinner than three pixels is no limb.
     limbs = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
     strands = (distance2 > _OFF_LINE2) & (nearest.from_lit2 > _OFF_LINE2) & ~unknown
-    return Found(limbs, _connected(mask | strands, limbs))
+    return Found(limbs, _connected(mask | strands, limbs), float(excess.max()))
 
 
 def _without_shadow(

@@ -31,6 +31,8 @@ Bool = NDArray[np.bool_]
 # what part of it there may be more or less light.
 _COLOUR, _LEAST_COLOUR = 0.04, 0.002
 _SHADING = 0.25
+# In compressed footage colours are coarser than luma (Rec.709): their alpha is so far from its own.
+_LUMA, _FRINGE = np.array([0.2126, 0.7152, 0.0722], np.float32), 0.15
 # Once alpha is known, how far the pixel's own may be.
 _OWN_COLOUR = 0.6
 # How far β is from that of the ground around where that is even.
@@ -93,7 +95,9 @@ def ground_beta(beta: Float32, ground: Bool) -> Float32:
     return fill_membrane(known, ground.astype(np.float32))[..., 0]
 
 
-def measure(image: Float32, trimap: UInt8, behind: Float32, backdrop: Backdrop) -> Measured:
+def measure(
+    image: Float32, trimap: UInt8, behind: Float32, backdrop: Backdrop, excess: float = 1
+) -> Measured:
     """Alpha where a trimap is unknown, if all of [0, 1] is as likely.
 
     Args:
@@ -101,6 +105,7 @@ def measure(image: Float32, trimap: UInt8, behind: Float32, backdrop: Backdrop) 
         trimap: (H, W) uint8; 0 and 255 are kept as they are. Without any 255 all is background:
             there is no figure to mix with.
         behind: (H, W), β from `ground_beta`.
+        excess: by how much more than its noise the frame is off beside the figure, ≥ 1.
     """
     solid = trimap == FIGURE
     alpha = solid.astype(np.float32)
@@ -109,7 +114,7 @@ def measure(image: Float32, trimap: UInt8, behind: Float32, backdrop: Backdrop) 
         return Measured(alpha, error, misfit)
     around = _around(solid, behind, None)
     for part in _blocks(trimap == UNKNOWN):
-        pixels = _gather(image, part, around, backdrop)
+        pixels = _gather(image, part, around, backdrop, excess)
         mean, deviation = np.full_like(pixels.far, 0.5), np.full_like(pixels.far, 3)
         alpha[part], error[part], misfit[part], _ = _most_probable(pixels, mean, deviation)
     return Measured(alpha, error, misfit)
@@ -122,6 +127,7 @@ def solve(
     backdrop: Backdrop,
     reach: int,
     prior: Prior,
+    excess: float = 1,
 ) -> Solved:
     """Alpha and F where a trimap is unknown; arguments as for `measure`.
 
@@ -136,7 +142,7 @@ def solve(
         return Solved(alpha, foreground)
     around = _around(solid, behind, reach)
     for part in _blocks(trimap == UNKNOWN):
-        pixels = _gather(image, part, around, backdrop)
+        pixels = _gather(image, part, around, backdrop, excess)
         mean, deviation = np.empty_like(pixels.far), np.empty_like(pixels.far)
         mean[:] = prior.mean[part][:, np.newaxis]
         deviation[:] = prior.deviation[part][:, np.newaxis]
@@ -209,6 +215,7 @@ class _Pixels(NamedTuple):
         even: (N, K), standard deviation of β.
         figure, shading: (3, N, K), F, and its standard deviation as there is more or less light.
         far: (N, K), how much the likelihood's logarithm is less than that of what is nearest.
+        fringe: standard deviation of the colours' alpha from that of luma.
     """
 
     seen: Float32
@@ -220,9 +227,12 @@ class _Pixels(NamedTuple):
     figure: Float32
     shading: Float32
     far: Float32
+    fringe: float
 
 
-def _gather(image: Float32, unknown: Places, around: _Around, backdrop: Backdrop) -> _Pixels:
+def _gather(
+    image: Float32, unknown: Places, around: _Around, backdrop: Backdrop, excess: float = 1
+) -> _Pixels:
     """If there is a darkest β there are two more explanations, each with the nearest part of the
     figure: the ground's β is anything from that to what is expected; or the figure is in its own
     shade."""
@@ -268,6 +278,7 @@ def _gather(image: Float32, unknown: Places, around: _Around, backdrop: Backdrop
         figure=figure,
         shading=shading,
         far=far,
+        fringe=_FRINGE * (1 - 1 / excess**2),
     )
 
 
@@ -311,9 +322,11 @@ def _most_probable(
     contrast, above = pixels.figure - pixels.behind, pixels.seen - pixels.behind
     shift, shading = pixels.shift, pixels.shading
     colour = _colour_variance(pixels.figure)
+    fringe = np.float32(pixels.fringe) * (contrast - np.tensordot(_LUMA, contrast, 1))
+    fixed = pixels.noise + fringe**2
     alpha = np.broadcast_to(mean, contrast.shape[1:])
     for _ in range(_ROUNDS):
-        variance = pixels.noise + alpha**2 * colour + (1 - alpha) ** 2 * pixels.error
+        variance = fixed + alpha**2 * colour + (1 - alpha) ** 2 * pixels.error
         weight = 1 / variance
         even = 1 / (pixels.even * np.maximum(1 - alpha, np.float32(0.05))) ** 2
         level = 1 / np.maximum(alpha, np.float32(0.05)) ** 2

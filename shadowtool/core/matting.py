@@ -85,10 +85,11 @@ def pull_figure(
     wide = wide_trimap(found.mask, found.maybe, reach)
     wide = np.where(drawn[box] == UNKNOWN, wide, drawn[box])
     behind = ground_beta(nearest.beta, (wide == BACKGROUND) & ~unknown[box])
-    prior = edge_prior(*measure(part, wide, behind, ground), wide, found.mask, reach)
+    first = measure(part, wide, behind, ground, found.excess)
+    prior = edge_prior(*first, wide, found.mask, reach)
     narrow = narrowed(wide, prior, found.mask)
     prior = doubted(prior, nearest.distance2)
-    solved = solve(part, narrow, behind, ground, reach, prior)
+    solved = solve(part, narrow, behind, ground, reach, prior, found.excess)
     whole = np.where(solved.alpha > 1 - _NOTHING, np.float32(1), solved.alpha)
     alpha[box] = np.where(whole < _NOTHING, np.float32(0), whole)
     np.multiply(alpha[box][..., np.newaxis], solved.foreground, out=foreground[box])
@@ -156,4 +157,4 @@ def _around(mask: Bool) -> Box | None:
 def _within(found: Found, drawn: UInt8) -> Found:
     """What was found, as far as a drawn trimap leaves it open."""
     mask = (drawn == FIGURE) | ((drawn == UNKNOWN) & found.mask)
-    return Found(mask, mask | ((drawn == UNKNOWN) & found.maybe))
+    return found._replace(mask=mask, maybe=mask | ((drawn == UNKNOWN) & found.maybe))

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -118,6 +119,20 @@ def test_light_on_the_figure_may_change_towards_its_rim(given_prior: bool) -> No
     else:
         alpha = measure(image, trimap, ground, BACKDROP).alpha
     assert np.abs(alpha - DISK)[trimap == UNKNOWN].mean() < 0.03
+
+
+def test_where_colours_are_coarser_than_luma_luma_tells_alpha() -> None:
+    given = shot(DISK, SHADE, colour=np.float32([0.9, 0.6, 0.1]))
+    luma = given.image @ np.float32([0.2126, 0.7152, 0.0722])
+    colours_alone = cv2.blur(given.image - luma[..., None], (4, 1))
+    image = colours_alone + luma[..., None]
+    trimap = trimap_of(DISK, 2)
+    ground = behind(given, trimap)
+    coarse, fine = (
+        np.abs(measure(image, trimap, ground, BACKDROP, excess).alpha - DISK)[trimap == UNKNOWN]
+        for excess in (3, 1)
+    )
+    assert coarse.mean() < 0.8 * fine.mean()
 
 
 def test_a_sliver_of_shadow_at_a_sole_is_ground_though_ground_around_is_lit() -> None:

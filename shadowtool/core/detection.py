@@ -35,16 +35,19 @@ _STEP, _LEAST_TEXTURE = 0.2, 0.03
 _SHARING, _LIKE, _GUIDE_POWER = 20.0, 10.0, 0.3
 # A pixel at the figure's edge, or connected with it, that is so far off the line is not background.
 _OFF_LINE2 = 12.0
-# One that is no further from L is not figure, whatever its neighbours are: gaps are narrow.
+# One that is no further from L, and does not hide its texture, is no figure whatever is around it:
+# gaps are narrow.
 _ON_LIT2 = 9.0
 # Of normal noise 9 pixels in 10 are within this distance of the line, in two dimensions.
 _NINE_TENTHS = 2.15
 _LARGEST_ERROR, _LEAST_SAMPLE = 3.0, 100
 # In and around a figure, this many times its edges' reach, there may be shadow where ground so many
-# times that far away is in it, or below the second β beside the figure. Elsewhere the light is that
-# of the ground around, give or take, or a shadow costs as much as this squared distance.
+# times that far away is below the first β, or ground beside the figure below the second.
 _RING, _NO_SHADOW, _LIT, _FULL = 2, 5, 0.8, 0.15
-_LIGHT, _NO_SHADOW2 = 0.1, 8.0
+# Elsewhere what is below this β is ground in the light that is seen around it, give or take the
+# second, or a shadow, which costs as much as the third, a squared distance. Above it there is what
+# a figure takes of the sky.
+_DIMMED, _LIGHT, _NO_SHADOW2 = 0.6, 0.1, 8.0
 # What is so many pixels from the figure has nothing of it; beside it begins sooner.
 _AWAY, _BESIDE = 5, 1
 # A figure is at least this part of the picture, a hole in it at least that; neither is but a few
@@ -107,7 +110,7 @@ def find_figure(
         square = np.ones((3, 3), np.uint8)
         edge = (cv2.dilate(figure, square) > 0) & (cv2.erode(figure, square) == 0)
         figure[edge & (distance2 > _OFF_LINE2)] = 1
-        figure[(nearest.from_lit2 < _ON_LIT2) & (hint != FIGURE) & ~unknown] = 0
+        figure[(nearest.from_lit2 < _ON_LIT2) & (other < 0) & ~unknown] = 0
         return _solid(figure, frame_size)
 
     mask = mask_of(nearest.distance2)
@@ -132,8 +135,8 @@ def _without_shadow(
     unknown: Bool,
     reach: int,
 ) -> tuple[Places, Float32]:
-    """Pixels in and around a figure that have no shadow near them, and their squared distance (N)
-    in standard deviations from the background in the light that is seen around them."""
+    """Dark pixels in and around a figure that have no shadow near them, and their squared distance
+    (N) in standard deviations from the background in the light that is seen around them."""
     size = 2 * _RING * reach + 1
     ring = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
     seen = ~(ring | unknown)
@@ -144,7 +147,7 @@ def _without_shadow(
     size = 2 * _NO_SHADOW * reach + 1
     darkest = np.where(full, np.float32(0), beta)
     darkest = cv2.erode(darkest, np.ones((size, size), np.uint8))
-    places = np.nonzero(ring & (darkest > _LIT))
+    places = np.nonzero(ring & (darkest > _LIT) & (nearest.beta < _DIMMED))
     here, value = backdrop.at(places), image[places]
     weight = 1 / here.variance(value)
     off, shift = value - here.under(beta[places]), here.lit - here.shadow

@@ -38,10 +38,9 @@ _OWN_COLOUR = 0.6
 # How far β is from that of the ground around where that is even.
 _BETA = 0.02
 # There may be shadow that is only seen so many times the edges' reach away. How rare that is, as is
-# a figure in its own shade: exp(-the second).
-_UNSEEN_REACHES, _RARE = 5, 2.0
-# Alpha is then below the first, or off from what is expected by the second.
-_IN_SHADOW, _IN_SHADE = 0.3, 0.5
+# a figure in its own shade: exp(-the second). Alpha is then off by the third from 0, or from what
+# else is expected.
+_UNSEEN_REACHES, _RARE, _OFF = 5, 2.0, 0.3
 # Within so many pixels β is looked at for evenness.
 _EVEN_RADIUS = 4
 # What near parts of the figure are tried: the nearest, and those nearest to places (down, right)
@@ -146,8 +145,8 @@ def solve(
         mean, deviation = np.empty_like(pixels.far), np.empty_like(pixels.far)
         mean[:] = prior.mean[part][:, np.newaxis]
         deviation[:] = prior.deviation[part][:, np.newaxis]
-        mean[:, -2], deviation[:, -2] = 0, _IN_SHADOW
-        deviation[:, -1] = np.maximum(deviation[:, -1], np.float32(_IN_SHADE))
+        mean[:, -2], deviation[:, -2] = 0, _OFF
+        deviation[:, -1] = np.maximum(deviation[:, -1], np.float32(_OFF))
         alpha[part], error, _, share = _most_probable(pixels, mean, deviation)
         foreground[part] = _colour(pixels, alpha[part], error, share).T
     return Solved(alpha, np.maximum(foreground, 0, out=foreground))

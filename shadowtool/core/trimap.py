@@ -35,8 +35,9 @@ _BLURRED_DEVIATION = 0.3
 _LIKE_BACKGROUND2, _DOUBT = 8.0, 0.35
 # Of what hangs loosely on a figure little is expected, which hair is exact enough to overcome.
 _LOOSE = (0.1, 0.25)
-# From this mean inwards all is figure.
-_OPAQUE = 0.9
+# What is expected to be this opaque is not doubted; from the second mean inwards all is figure:
+# none of the ground is in its colours.
+_OPAQUE, _SOLID = 0.9, 0.97
 
 
 class Prior(NamedTuple):
@@ -130,7 +131,7 @@ def narrowed(trimap: UInt8, prior: Prior, mask: Bool) -> UInt8:
     """A trimap whose unknown band is as wide as its edge; the mask's rim stays in it."""
     inside = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     narrow = trimap.copy()
-    narrow[(trimap == UNKNOWN) & inside & (prior.mean >= _OPAQUE)] = FIGURE
+    narrow[(trimap == UNKNOWN) & inside & (prior.mean >= _SOLID)] = FIGURE
     return narrow
 
 

@@ -36,8 +36,8 @@ _LIKE_BACKGROUND2, _DOUBT = 8.0, 0.35
 # Of what hangs loosely on a figure little is expected, which hair is exact enough to overcome.
 _LOOSE = (0.1, 0.25)
 # What is expected to be this opaque is not doubted; from the second mean inwards all is figure:
-# none of the ground is in its colours.
-_OPAQUE, _SOLID = 0.9, 0.97
+# hardly any of the ground is in its colours.
+_OPAQUE, _SOLID = 0.9, 0.95
 
 
 class Prior(NamedTuple):

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.backdrop import Backdrop, Nearest
+from shadowtool.core.backdrop import Backdrop, Nearest, Places
+from shadowtool.core.filling import fill_membrane
 from shadowtool.core.trimap import BACKGROUND, FIGURE
 
 Float32 = NDArray[np.float32]
@@ -34,9 +35,19 @@ _STEP, _LEAST_TEXTURE = 0.2, 0.03
 _SHARING, _LIKE, _GUIDE_POWER = 20.0, 10.0, 0.3
 # A pixel at the figure's edge, or connected with it, that is so far off the line is not background.
 _OFF_LINE2 = 12.0
+# One that is no further from L, and does not hide its texture, is no figure whatever is around it:
+# gaps are narrow.
+_ON_LIT2 = 9.0
 # Of normal noise 9 pixels in 10 are within this distance of the line, in two dimensions.
 _NINE_TENTHS = 2.15
 _LARGEST_ERROR, _LEAST_SAMPLE = 3.0, 100
+# In and around a figure, this many times its edges' reach, there may be shadow where ground so many
+# times that far away is below the first β, or ground beside the figure below the second.
+_RING, _NO_SHADOW, _LIT, _FULL = 2, 5, 0.8, 0.15
+# Elsewhere what is below this β is ground in the light that is seen around it, give or take the
+# second, or a shadow, which costs as much as the third, a squared distance. Above it there is what
+# a figure takes of the sky.
+_DIMMED, _LIGHT, _NO_SHADOW2 = 0.6, 0.1, 8.0
 # What is so many pixels from the figure has nothing of it; beside it begins sooner.
 _AWAY, _BESIDE = 5, 1
 # A figure is at least this part of the picture, a hole in it at least that; neither is but a few
@@ -50,10 +61,12 @@ class Found(NamedTuple):
     Attributes:
         mask: (H, W) bool, most of the pixel shows the figure; nothing thin.
         maybe: (H, W) bool, mask and what hangs on it that is not background, strands above all.
+        excess: by how much more than noise the ground is off its line, where it is most so; ≥ 1.
     """
 
     mask: Bool
     maybe: Bool
+    excess: float
 
 
 def changed(image: Float32, backdrop: Backdrop) -> Bool:
@@ -70,6 +83,7 @@ def find_figure(
     unknown: Bool,
     hint: UInt8,
     frame_size: int,
+    reach: int,
 ) -> Found:
     """The figure in a frame, or in a part of it.
 
@@ -79,6 +93,7 @@ def find_figure(
         unknown: (H, W), nothing can be said of the pixel.
         hint: (H, W) uint8, a trimap that may be a little off; 128 says nothing.
         frame_size: how many pixels the whole frame has.
+        reach: how far from the figure's edge it may at first be missed, pixels.
     """
     other = texture_evidence(image, backdrop)
     other[unknown] = 0
@@ -95,18 +110,51 @@ def find_figure(
         square = np.ones((3, 3), np.uint8)
         edge = (cv2.dilate(figure, square) > 0) & (cv2.erode(figure, square) == 0)
         figure[edge & (distance2 > _OFF_LINE2)] = 1
+        figure[(nearest.from_lit2 < _ON_LIT2) & (other < 0) & ~unknown] = 0
         return _solid(figure, frame_size)
 
-    distance2 = nearest.distance2
+    mask = mask_of(nearest.distance2)
+    if not mask.any():
+        return Found(mask, mask, 1.0)
+    excess = _background_error(nearest, mask)
+    distance2 = nearest.distance2 / excess**2
+    ring, shadow2 = _without_shadow(image, backdrop, nearest, mask, unknown, reach)
+    distance2[ring] = np.minimum(distance2[ring] + np.float32(_NO_SHADOW2), shadow2)
     mask = mask_of(distance2)
-    error = _background_error(nearest, mask)
-    if (error > 1).any():
-        distance2 = distance2 / error**2
-        mask = mask_of(distance2)
     # What is thinner than three pixels is no limb.
     limbs = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
     strands = (distance2 > _OFF_LINE2) & (nearest.from_lit2 > _OFF_LINE2) & ~unknown
-    return Found(limbs, _connected(mask | strands, limbs))
+    return Found(limbs, _connected(mask | strands, limbs), float(excess.max()))
+
+
+def _without_shadow(
+    image: Float32,
+    backdrop: Backdrop,
+    nearest: Nearest,
+    mask: Bool,
+    unknown: Bool,
+    reach: int,
+) -> tuple[Places, Float32]:
+    """Dark pixels in and around a figure that have no shadow near them, and their squared distance
+    (N) in standard deviations from the background in the light that is seen around them."""
+    size = 2 * _RING * reach + 1
+    ring = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    seen = ~(ring | unknown)
+    known = np.where(seen, nearest.beta, np.float32(0))[..., np.newaxis]
+    beta = fill_membrane(known, seen.astype(np.float32))[..., 0]
+    full = (nearest.beta < _FULL) & (nearest.distance2 < _OFF_LINE2) & ~mask & ~unknown
+    full = cv2.morphologyEx(full.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    size = 2 * _NO_SHADOW * reach + 1
+    darkest = np.where(full, np.float32(0), beta)
+    darkest = cv2.erode(darkest, np.ones((size, size), np.uint8))
+    places = np.nonzero(ring & (darkest > _LIT) & (nearest.beta < _DIMMED))
+    here, value = backdrop.at(places), image[places]
+    weight = 1 / here.variance(value)
+    off, shift = value - here.under(beta[places]), here.lit - here.shadow
+    # β may be off by so much: rank one more in the covariance.
+    along = (weight * off * shift).sum(axis=-1) ** 2
+    along /= (weight * shift**2).sum(axis=-1) + np.float32(1 / _LIGHT**2)
+    return places, np.asarray((weight * off**2).sum(axis=-1) - along, np.float32)
 
 
 def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:

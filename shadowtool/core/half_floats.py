@@ -59,6 +59,14 @@ def all_finite(halfs: Float16) -> bool:
     return not bits.size or bool(bits.max() < _INFINITE)
 
 
+def not_finite(image: NDArray[np.floating]) -> NDArray[np.bool_] | None:
+    """Where a channel of an image (H, W, C) is NaN or infinite, (H, W); None for nowhere."""
+    if image.dtype == np.float16 and all_finite(np.asarray(image, np.float16)):
+        return None
+    finite = np.isfinite(image)
+    return None if finite.all() else ~finite.all(axis=-1)
+
+
 def _converted(values: NDArray[np.floating], depth: int) -> NDArray[np.generic]:
     # OpenCV takes a third axis for channels, and not more than four of them.
     rows = np.ascontiguousarray(values).reshape(values.shape[0] if values.ndim else 1, -1)

@@ -1,9 +1,13 @@
 """Alpha and colour of a figure before a background that is known but for its shadow.
 
-C = αF + (1 - α)B(β). F is that of a near part of the figure, give or take; β is that of the ground
-around, give or take. For each of several near parts the most probable α and β follow in closed form
-(after Bayesian matting, Chuang et al. 2001, whose background is here a line), and what they give is
-averaged by how well each explains the pixel.
+C = αF + (1 - α)B(β). F is that of a near part of the figure in more or less light; β is that of
+the ground around, give or take. For each of several near parts the most probable α, β and light on
+the figure follow in closed form (after Bayesian matting, Chuang et al. 2001, whose background and
+figure are here lines), and what they give is averaged by how well each explains the pixel.
+
+Where alpha is known beforehand, give or take, it may still be quite another: there the ground may
+be in a shadow that is only seen further away, as under a sole, or the figure may turn into its own
+shade, as what is round does at its rim. These are two explanations more.
 """
 
 from collections.abc import Iterator
@@ -23,21 +27,43 @@ Index = NDArray[np.intp]
 Places = tuple[Index, ...]
 Bool = NDArray[np.bool_]
 
-# How far the figure's colour is from that of its near part, as a part of it, and at least.
-_COLOUR, _LEAST_COLOUR = 0.08, 0.002
+# How far the figure's colour is from that of its near part, as a part of it, and at least; and by
+# what part of it there may be more or less light.
+_COLOUR, _LEAST_COLOUR = 0.04, 0.002
+_SHADING = 0.25
+# In compressed footage colours are coarser than luma (Rec.709): their alpha is so far from its own.
+_LUMA, _FRINGE = np.array([0.2126, 0.7152, 0.0722], np.float32), 0.15
 # Once alpha is known, how far the pixel's own may be.
 _OWN_COLOUR = 0.6
 # How far β is from that of the ground around where that is even.
 _BETA = 0.02
-# Under a foot there may be shadow that is only seen so far away, rarely: exp(-the second).
-_DARKEST_RADIUS, _UNSEEN = 6, 2.0
+# There may be shadow that is only seen so many times the edges' reach away. How rare that is, as is
+# a figure in its own shade: exp(-the second). Alpha is then off by the third from 0, or from what
+# else is expected.
+_UNSEEN_REACHES, _RARE, _OFF = 5, 2.0, 0.3
 # Within so many pixels β is looked at for evenness.
 _EVEN_RADIUS = 4
-# What near parts of the figure are tried: the nearest, and those nearest to places this far off;
-# one at this distance counts less by exp(-1/2).
-_AROUND, _FAR = 3.0, 6.0
+# What near parts of the figure are tried: the nearest, and those nearest to places (down, right)
+# this far off; one at the second distance counts less by exp(-1/2).
+_AROUND, _FAR = 3, 6.0
+_STEPS = ((0, 0), (_AROUND, 0), (-_AROUND, 0), (0, _AROUND), (0, -_AROUND))
 _ROUNDS = 2
 _BLOCK = 1 << 16
+
+
+class Measured(NamedTuple):
+    """What a frame by itself tells of a figure's matte.
+
+    Attributes:
+        alpha: (H, W) float32 in [0, 1].
+        error: (H, W) float32, standard deviation of alpha where the trimap is unknown, else 0.
+        misfit: (H, W) float32, squared distance of C from its explanation in standard deviations,
+            where the trimap is unknown, else 0.
+    """
+
+    alpha: Float32
+    error: Float32
+    misfit: Float32
 
 
 class Solved(NamedTuple):
@@ -46,15 +72,10 @@ class Solved(NamedTuple):
     Attributes:
         alpha: (H, W) float32 in [0, 1].
         foreground: (H, W, 3) float32 ≥ 0, F where alpha is above 0, not premultiplied.
-        error: (H, W) float32, standard deviation of alpha where the trimap is unknown, else 0.
-        misfit: (H, W) float32, squared distance of C from its explanation in standard deviations,
-            where the trimap is unknown, else 0.
     """
 
     alpha: Float32
     foreground: Float32
-    error: Float32
-    misfit: Float32
 
 
 def ground_beta(beta: Float32, ground: Bool) -> Float32:
@@ -73,36 +94,67 @@ def ground_beta(beta: Float32, ground: Bool) -> Float32:
     return fill_membrane(known, ground.astype(np.float32))[..., 0]
 
 
-def solve(
-    image: Float32, trimap: UInt8, behind: Float32, backdrop: Backdrop, prior: Prior | None = None
-) -> Solved:
-    """Alpha and F where a trimap is unknown.
+def measure(
+    image: Float32, trimap: UInt8, behind: Float32, backdrop: Backdrop, excess: float = 1
+) -> Measured:
+    """Alpha where a trimap is unknown, if all of [0, 1] is as likely.
 
     Args:
         image: (H, W, 3) float32, linear light, without NaN.
         trimap: (H, W) uint8; 0 and 255 are kept as they are. Without any 255 all is background:
             there is no figure to mix with.
         behind: (H, W), β from `ground_beta`.
-        prior: of alpha; None if all of [0, 1] is as likely.
+        excess: by how much more than its noise the frame is off beside the figure, ≥ 1.
     """
-    alpha = np.where(trimap == FIGURE, np.float32(1), np.float32(0))
-    foreground = image * alpha[..., np.newaxis]
-    error, misfit = np.zeros_like(alpha), np.zeros_like(alpha)
     solid = trimap == FIGURE
+    alpha = solid.astype(np.float32)
+    error, misfit = np.zeros_like(alpha), np.zeros_like(alpha)
     if not solid.any():
-        return Solved(alpha, foreground, error, misfit)
+        return Measured(alpha, error, misfit)
+    around = _around(solid, behind, None)
     for part in _blocks(trimap == UNKNOWN):
-        mean = np.full(part[0].shape, 0.5, np.float32)
-        deviation = np.full(part[0].shape, 3, np.float32)
-        if prior is not None:
-            mean, deviation = prior.mean[part], prior.deviation[part]
-        pixels = _gather(image, solid, part, behind, backdrop, darkest=prior is not None)
-        alpha[part], error[part], misfit[part], share = _most_probable(pixels, mean, deviation)
-        foreground[part] = _colour(pixels, alpha[part], error[part], share).T
-    return Solved(alpha, np.maximum(foreground, 0), error, misfit)
+        pixels = _gather(image, part, around, backdrop, excess)
+        mean, deviation = np.full_like(pixels.far, 0.5), np.full_like(pixels.far, 3)
+        alpha[part], error[part], misfit[part], _ = _most_probable(pixels, mean, deviation)
+    return Measured(alpha, error, misfit)
 
 
-def colours(image: Float32, alpha: Float32, behind: Float32, backdrop: Backdrop) -> Float32:
+def solve(
+    image: Float32,
+    trimap: UInt8,
+    behind: Float32,
+    backdrop: Backdrop,
+    reach: int,
+    prior: Prior,
+    excess: float = 1,
+) -> Solved:
+    """Alpha and F where a trimap is unknown; arguments as for `measure`.
+
+    Args:
+        reach: how far the figure's edges go, pixels; shadow is looked for in this measure.
+        prior: of alpha.
+    """
+    solid = trimap == FIGURE
+    alpha = solid.astype(np.float32)
+    foreground = image * alpha[..., np.newaxis]
+    if not solid.any():
+        return Solved(alpha, foreground)
+    around = _around(solid, behind, reach)
+    for part in _blocks(trimap == UNKNOWN):
+        pixels = _gather(image, part, around, backdrop, excess)
+        mean, deviation = np.empty_like(pixels.far), np.empty_like(pixels.far)
+        mean[:] = prior.mean[part][:, np.newaxis]
+        deviation[:] = prior.deviation[part][:, np.newaxis]
+        mean[:, -2], deviation[:, -2] = 0, _OFF
+        deviation[:, -1] = np.maximum(deviation[:, -1], np.float32(_OFF))
+        alpha[part], error, _, share = _most_probable(pixels, mean, deviation)
+        foreground[part] = _colour(pixels, alpha[part], error, share).T
+    return Solved(alpha, np.maximum(foreground, 0, out=foreground))
+
+
+def colours(
+    image: Float32, alpha: Float32, behind: Float32, backdrop: Backdrop, reach: int
+) -> Float32:
     """F for an alpha that is given; arguments as for `solve`.
 
     Where nothing is quite opaque, what is most so stands for the figure's colour.
@@ -112,12 +164,14 @@ def colours(image: Float32, alpha: Float32, behind: Float32, backdrop: Backdrop)
     """
     solid = alpha >= min(0.99, float(alpha.max()))
     foreground = np.where((solid & (alpha > 0))[..., np.newaxis], image, np.float32(0))
+    around = _around(solid, behind, reach)
     for part in _blocks((alpha > 0) & ~solid):
-        pixels = _gather(image, solid, part, behind, backdrop, darkest=True)
+        pixels = _gather(image, part, around, backdrop)
         given = alpha[part]
-        *_, share = _most_probable(pixels, given, np.full(given.shape, 1e-3, np.float32))
+        sure = np.full_like(pixels.far, 1e-3)
+        *_, share = _most_probable(pixels, given[:, np.newaxis], sure)
         foreground[part] = _colour(pixels, given, np.zeros_like(given), share).T
-    return np.maximum(foreground, 0)
+    return np.maximum(foreground, 0, out=foreground)
 
 
 def _blocks(mask: Bool) -> Iterator[Places]:
@@ -127,16 +181,40 @@ def _blocks(mask: Bool) -> Iterator[Places]:
         yield rows[start : start + _BLOCK], columns[start : start + _BLOCK]
 
 
+class _Around(NamedTuple):
+    """What there is around each pixel.
+
+    Attributes:
+        near: (H, W), the place of the figure's nearest part, counted row by row.
+        behind, uneven: (H, W), β and its standard deviation.
+        darkest: (H, W), the least β that is not far; None if none but ``behind`` is thought of.
+    """
+
+    near: Index
+    behind: Float32
+    uneven: Float32
+    darkest: Float32 | None
+
+
+def _around(solid: Bool, behind: Float32, reach: int | None) -> _Around:
+    darkest = None
+    if reach is not None:
+        size = 2 * _UNSEEN_REACHES * reach + 1
+        darkest = np.asarray(cv2.erode(behind, np.ones((size, size), np.uint8)), np.float32)
+    return _Around(_nearest(solid), behind, _unevenness(behind), darkest)
+
+
 class _Pixels(NamedTuple):
-    """N pixels that are mixed, and K near parts of the figure for each; colours by channel.
+    """N pixels that are mixed, and K explanations for each; colours by channel.
 
     Attributes:
         seen, noise: (3, N, 1), C and the variance of its noise.
         behind, shift, error: (3, N, K), B, by how much it changes with β, and the variance of its
             own error.
-        even: (N, 1), standard deviation of β.
-        figure: (3, N, K), F of the near parts.
-        far: (N, K), how much the likelihood's logarithm falls with their distance.
+        even: (N, K), standard deviation of β.
+        figure, shading: (3, N, K), F, and its standard deviation as there is more or less light.
+        far: (N, K), how much the likelihood's logarithm is less than that of what is nearest.
+        fringe: standard deviation of the colours' alpha from that of luma.
     """
 
     seen: Float32
@@ -146,35 +224,31 @@ class _Pixels(NamedTuple):
     error: Float32
     even: Float32
     figure: Float32
+    shading: Float32
     far: Float32
+    fringe: float
 
 
 def _gather(
-    image: Float32,
-    solid: Bool,
-    unknown: Places,
-    behind: Float32,
-    backdrop: Backdrop,
-    darkest: bool,
+    image: Float32, unknown: Places, around: _Around, backdrop: Backdrop, excess: float = 1
 ) -> _Pixels:
-    """With ``darkest`` the last near part is the nearest once more, before the darkest ground
-    around."""
+    """If there is a darkest β there are two more explanations, each with the nearest part of the
+    figure: the ground's β is anything from that to what is expected; or the figure is in its own
+    shade."""
     rows, columns = unknown
-    height, width = solid.shape
-    steps = [(0, 0)]
-    for turn in range(8):
-        angle = turn * np.pi / 4
-        steps.append((round(_AROUND * np.sin(angle)), round(_AROUND * np.cos(angle))))
-    betas, which = [behind[unknown]], [0] * len(steps)
-    if darkest:
-        window = np.ones((2 * _DARKEST_RADIUS + 1,) * 2, np.uint8)
-        betas.append(np.asarray(cv2.erode(behind, window)[unknown], np.float32))
-        which.append(1)
-        steps.append(steps[0])
-    near = _nearest(solid)
+    height, width = image.shape[:2]
+    steps, which = list(_STEPS), [0] * len(_STEPS)
+    sample, plates = image[unknown], backdrop.at(unknown)
+    betas, uneven = [around.behind[unknown]], [around.uneven[unknown]]
+    if around.darkest is not None:
+        half = np.asarray((betas[0] - around.darkest[unknown]) / 2, np.float32)
+        betas.append(betas[0] - half)
+        uneven.append(np.maximum(uneven[0], half))
+        steps += [(0, 0), (0, 0)]
+        which += [1, 0]
     chosen = np.stack(
         [
-            near[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]
+            around.near[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]
             for down, right in steps
         ],
         axis=1,
@@ -182,9 +256,14 @@ def _gather(
     away = (chosen // width - rows[:, np.newaxis]) ** 2
     away = away + (chosen % width - columns[:, np.newaxis]) ** 2
     far = (away / (2 * _FAR**2)).astype(np.float32)
-    if darkest:
-        far[:, -1] += np.float32(_UNSEEN)
-    sample, plates = image[unknown], backdrop.at(unknown)
+    figure = np.ascontiguousarray(np.moveaxis(image.reshape(-1, 3)[chosen], -1, 0))
+    shading = np.float32(_SHADING) * figure
+    if around.darkest is not None:
+        far[:, -2:] += np.float32(_RARE)
+        far[half < uneven[0], -2] = np.inf
+        shade = np.clip(plates.shadow / np.maximum(plates.lit, np.float32(1e-3)), 0, 1).T
+        shading[..., -1] = (1 - shade) / 2 * figure[..., -1]
+        figure[..., -1] *= (1 + shade) / 2
     span = plates.lit - plates.shadow
     shifts = [np.where(beta[:, np.newaxis] >= 0, span, plates.shadow) for beta in betas]
     grounds = [plates.under(beta) for beta in betas]
@@ -194,9 +273,11 @@ def _gather(
         behind=_by_channel(*grounds)[..., which],
         shift=_by_channel(*shifts)[..., which],
         error=_by_channel(*(plates.own_variance(ground) for ground in grounds))[..., which],
-        even=_unevenness(behind)[unknown][:, np.newaxis],
-        figure=np.ascontiguousarray(np.moveaxis(image.reshape(-1, 3)[chosen], -1, 0)),
+        even=np.stack(uneven, axis=-1)[:, which],
+        figure=figure,
+        shading=shading,
         far=far,
+        fringe=_FRINGE * (1 - 1 / excess**2),
     )
 
 
@@ -226,39 +307,52 @@ def _unevenness(behind: Float32) -> Float32:
 def _most_probable(
     pixels: _Pixels, mean: Float32, deviation: Float32
 ) -> tuple[Float32, Float32, Float32, Float32]:
-    """Alpha, its standard deviation and the least misfit (N), and how much each near part explains
-    (N, K).
+    """Alpha, its standard deviation and the least misfit (N), and how much each explanation is
+    worth (N, K).
 
-    With the variance of C fixed the posterior of alpha and of how far (1 - α)β is from what is
-    expected is normal; the variance, which depends on alpha, follows in a second round.
+    With the variance of C fixed the posterior of alpha, of how far (1 - α)β is from what is
+    expected, and of how far the light on αF is, is normal; the variance, which depends on alpha,
+    follows in a second round.
+
+    Args:
+        mean, deviation: (N, K), what is expected of alpha.
     """
-    mean = mean[:, np.newaxis]
-    trust = 1 / deviation[:, np.newaxis] ** 2
+    trust = 1 / deviation**2
     contrast, above = pixels.figure - pixels.behind, pixels.seen - pixels.behind
+    shift, shading = pixels.shift, pixels.shading
     colour = _colour_variance(pixels.figure)
+    fringe = np.float32(pixels.fringe) * (contrast - np.tensordot(_LUMA, contrast, 1))
+    fixed = pixels.noise + fringe**2
     alpha = np.broadcast_to(mean, contrast.shape[1:])
     for _ in range(_ROUNDS):
-        variance = pixels.noise + alpha**2 * colour + (1 - alpha) ** 2 * pixels.error
+        variance = fixed + alpha**2 * colour + (1 - alpha) ** 2 * pixels.error
         weight = 1 / variance
         even = 1 / (pixels.even * np.maximum(1 - alpha, np.float32(0.05))) ** 2
-        weighted = weight * contrast
-        alpha_alpha = (weighted * contrast).sum(axis=0) + trust
-        alpha_beta = (weighted * pixels.shift).sum(axis=0)
-        beta_beta = (weight * pixels.shift**2).sum(axis=0) + even
-        alpha_side = (weighted * above).sum(axis=0) + trust * mean
-        beta_side = (weight * pixels.shift * above).sum(axis=0)
-        determinant = alpha_alpha * beta_beta - alpha_beta**2
-        alpha = (alpha_side * beta_beta - beta_side * alpha_beta) / determinant
+        level = 1 / np.maximum(alpha, np.float32(0.05)) ** 2
+        # β and light are eliminated from the normal equations.
+        ground, light = weight * shift, weight * shading
+        ground_ground = (ground * shift).sum(axis=0) + even
+        light_light = (light * shading).sum(axis=0) + level
+        ground_light = (ground * shading).sum(axis=0)
+        minor = ground_ground * light_light - ground_light**2
+        sides = np.stack([(ground * contrast).sum(axis=0), (ground * above).sum(axis=0)])
+        lit_sides = np.stack([(light * contrast).sum(axis=0), (light * above).sum(axis=0)])
+        betas = (light_light * sides - ground_light * lit_sides) / minor
+        lights = (ground_ground * lit_sides - ground_light * sides) / minor
+        left = weight * (contrast - betas[0] * shift - lights[0] * shading)
+        information = (left * contrast).sum(axis=0) + trust
+        alpha = ((left * above).sum(axis=0) + trust * mean) / information
         alpha = np.clip(alpha, 0, 1)
-        beta = (beta_side - alpha_beta * alpha) / beta_beta
-    rest = above - alpha * contrast - beta * pixels.shift
-    misfit = (weight * rest**2).sum(axis=0) + even * beta**2
+    beta, lit = (parts[1] - alpha * parts[0] for parts in (betas, lights))
+    rest = above - alpha * contrast - beta * shift - lit * shading
+    misfit = (weight * rest**2).sum(axis=0) + even * beta**2 + level * lit**2
     likelihood = misfit + np.log(variance).sum(axis=0) + trust * (alpha - mean) ** 2
-    likelihood = -(likelihood + np.log(determinant / (even * trust))) / 2 - pixels.far
+    likelihood += np.log(minor * information / (even * level * trust))
+    likelihood = -likelihood / 2 - pixels.far
     share = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
     share /= share.sum(axis=1, keepdims=True)
     average = (share * alpha).sum(axis=1)
-    spread = (share * (alpha**2 + beta_beta / determinant)).sum(axis=1) - average**2
+    spread = (share * (alpha**2 + 1 / information)).sum(axis=1) - average**2
     return average, np.sqrt(np.maximum(spread, 0)), misfit.min(axis=1), share
 
 

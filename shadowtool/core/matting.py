@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.boxes import around
 from shadowtool.core.detection import Found, changed, find_figure
-from shadowtool.core.known_background import colours, ground_beta, solve
+from shadowtool.core.known_background import colours, ground_beta, measure, solve
 from shadowtool.core.trimap import (
     BACKGROUND,
     FIGURE,
@@ -80,19 +80,19 @@ def pull_figure(
     part, ground = seen[box], backdrop.at(box)
     nearest = ground.nearest(part)
     hint = drawn if hint is None else hint
-    found = find_figure(part, ground, nearest, unknown[box], hint[box], height * width)
+    found = find_figure(part, ground, nearest, unknown[box], hint[box], height * width, reach)
     found = _within(found, drawn[box])
     wide = wide_trimap(found.mask, found.maybe, reach)
     wide = np.where(drawn[box] == UNKNOWN, wide, drawn[box])
     behind = ground_beta(nearest.beta, (wide == BACKGROUND) & ~unknown[box])
-    first = solve(part, wide, behind, ground)
-    prior = edge_prior(first.alpha, first.error, first.misfit, wide, found.mask, reach)
+    first = measure(part, wide, behind, ground, found.excess)
+    prior = edge_prior(*first, wide, found.mask, reach)
     narrow = narrowed(wide, prior, found.mask)
     prior = doubted(prior, nearest.distance2)
-    solved = solve(part, narrow, behind, ground, prior)
+    solved = solve(part, narrow, behind, ground, reach, prior, found.excess)
     whole = np.where(solved.alpha > 1 - _NOTHING, np.float32(1), solved.alpha)
     alpha[box] = np.where(whole < _NOTHING, np.float32(0), whole)
-    foreground[box] = alpha[box][..., np.newaxis] * solved.foreground
+    np.multiply(alpha[box][..., np.newaxis], solved.foreground, out=foreground[box])
     foreground[bad] = 0
     trimap[box] = narrow
     return Figure(foreground, alpha, trimap)
@@ -113,7 +113,7 @@ def colour_figure(image: Float32, backdrop: Backdrop, unknown: Bool, alpha: Floa
         part, ground, cover = image[box], backdrop.at(box), alpha[box]
         seen, unknown, bad = _without_unknown(part, ground, unknown[box])
         behind = ground_beta(ground.nearest(seen).beta, (cover == 0) & ~unknown)
-        colour = cover[..., np.newaxis] * colours(seen, cover, behind, ground)
+        colour = cover[..., np.newaxis] * colours(seen, cover, behind, ground, _REACH)
         colour[bad] = 0
         foreground[box] = colour
     return Figure(foreground, alpha, np.asarray(trimap, np.uint8))
@@ -145,4 +145,4 @@ def _without_unknown(
 def _within(found: Found, drawn: UInt8) -> Found:
     """What was found, as far as a drawn trimap leaves it open."""
     mask = (drawn == FIGURE) | ((drawn == UNKNOWN) & found.mask)
-    return Found(mask, mask | ((drawn == UNKNOWN) & found.maybe))
+    return found._replace(mask=mask, maybe=mask | ((drawn == UNKNOWN) & found.maybe))

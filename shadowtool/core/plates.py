@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
-from shadowtool.core.half_floats import to_float
+from shadowtool.core.half_floats import not_finite, to_float
 from shadowtool.core.half_keys import finite_keys, from_keys
 
 Float32 = NDArray[np.float32]
@@ -124,8 +124,7 @@ def _order_keys(
     if image.dtype == np.float16:
         keys, _, bad = finite_keys(image.astype(np.float16, copy=False))
         return keys, bad
-    wrong = ~np.isfinite(image)
-    return np.asarray(image, np.float32), np.asarray(wrong.any(axis=-1)) if wrong.any() else None
+    return np.asarray(image, np.float32), not_finite(image)
 
 
 def _values(keys: NDArray[np.int16] | Float32) -> Float32:

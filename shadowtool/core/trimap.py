@@ -35,8 +35,9 @@ _BLURRED_DEVIATION = 0.3
 _LIKE_BACKGROUND2, _DOUBT = 8.0, 0.35
 # Of what hangs loosely on a figure little is expected, which hair is exact enough to overcome.
 _LOOSE = (0.1, 0.25)
-# From this mean inwards all is figure.
-_OPAQUE = 0.9
+# What is expected to be this opaque is not doubted; from the second mean inwards all is figure:
+# hardly any of the ground is in its colours.
+_OPAQUE, _SOLID = 0.9, 0.95
 
 
 class Prior(NamedTuple):
@@ -87,7 +88,7 @@ def edge_prior(
     usable = (trimap == UNKNOWN) & (error < _EXACT) & (misfit < _EXPLAINED)
     mean = np.where(layer > 0, np.float32(1), np.float32(0))
     deviation = np.full(mask.shape, _LEAST_DEVIATION, np.float32)
-    here = {}
+    elsewhere = {}
     for number in range(-1, reach + 2):
         own = layer == number
         sample = alpha[own & usable]
@@ -98,13 +99,16 @@ def edge_prior(
             expected, scatter = _SHARP.get(number, (float(number > 0), 0.0))
         mean[own] = expected
         deviation[own] = max(scatter, _LEAST_DEVIATION)
-        if number > 0:
-            here[number] = _along_edge(alpha, own & usable, expected)
+        elsewhere[number] = expected
+
+    def along(number: int) -> Float32:
+        return _along_edge(alpha, (layer == number) & usable, elsewhere[number])
+
     # Over a blurred edge alpha rises from layer to layer; that of another colour jumps.
-    rises = here[1] < _RISE * here[3]
-    for number, found in here.items():
-        own = layer == number
-        blurred = own & rises & (found < _BLURRED * mean)
+    rises = along(1) < _RISE * along(3)
+    for number in range(1, reach + 2):
+        found = along(number)
+        blurred = (layer == number) & rises & (found < _BLURRED * mean)
         mean[blurred] = found[blurred]
         deviation[blurred] = _BLURRED_DEVIATION
     loose = (trimap == UNKNOWN) & (layer < -1)
@@ -127,7 +131,7 @@ def narrowed(trimap: UInt8, prior: Prior, mask: Bool) -> UInt8:
     """A trimap whose unknown band is as wide as its edge; the mask's rim stays in it."""
     inside = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     narrow = trimap.copy()
-    narrow[(trimap == UNKNOWN) & inside & (prior.mean >= _OPAQUE)] = FIGURE
+    narrow[(trimap == UNKNOWN) & inside & (prior.mean >= _SOLID)] = FIGURE
     return narrow
 
 

@@ -13,7 +13,7 @@ from shadowtool.core import beta as shadow_beta
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.boxes import Box, around
 from shadowtool.core.exposure import frame_gain, without_gain
-from shadowtool.core.half_floats import to_float
+from shadowtool.core.half_floats import not_finite, to_float
 from shadowtool.core.holdout import grid_step, on_grid
 from shadowtool.core.matting import (
     HIDDEN,
@@ -24,7 +24,7 @@ from shadowtool.core.matting import (
     without_figure,
 )
 from shadowtool.core.noise import NoiseModel
-from shadowtool.core.plates import Plates, seen_pixels
+from shadowtool.core.plates import Plates
 from shadowtool.errors import OptionError
 from shadowtool.io.image import EXR, PNG, Header, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import read_plates
@@ -314,8 +314,7 @@ class _Take:
     def _shown(self, frame: Frame) -> _Shown:
         stored = self.footage.image(frame)
         light = stored.rgb(self.footage.transfer)
-        seen = seen_pixels(light, None)
-        bad = None if seen is None else ~seen
+        bad = not_finite(light)
         gain = 1.0
         if self.gain == "auto":
             with np.errstate(invalid="ignore"):

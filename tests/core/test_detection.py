@@ -7,11 +7,12 @@ from shadowtool.core.detection import Found, changed, find_figure, texture_evide
 from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
 from tests.figures import BACKDROP, DARK, KNOWN, SCENE, disk, shot, strand
 
+REACH = 4
 NOTHING = np.full(KNOWN.shape, UNKNOWN, np.uint8)
 
 
 def found_in(image: np.ndarray, backdrop: Backdrop = BACKDROP, hint: np.ndarray = NOTHING) -> Found:
-    return find_figure(image, backdrop, backdrop.nearest(image), KNOWN, hint, KNOWN.size)
+    return find_figure(image, backdrop, backdrop.nearest(image), KNOWN, hint, KNOWN.size, REACH)
 
 
 @pytest.mark.parametrize("soft", [1, 6, 40])
@@ -45,12 +46,45 @@ def test_dark_clothes_in_shadow_are_told_from_it_by_the_texture_that_they_hide()
     assert not mask[disk(70, 50, 22) == 0].any()
 
 
+@pytest.mark.parametrize("radius", [0, 3, 12])
+def test_what_looks_like_shadow_is_figure_where_there_is_none_around(radius: int) -> None:
+    # The rim of the figure looks nearly like ground in shadow, and no texture tells them apart.
+    alpha = disk(70, 50, 20)
+    even = np.full_like(SCENE.lit, 0.5)
+    backdrop = Backdrop(even, even / 4, BACKDROP.noise, BACKDROP.doubt)
+    rim = (alpha == 1) & (disk(67, 50, 18) == 0)
+    image = np.where(alpha[..., None] == 1, np.float32([0.05, 0.1, 0.6]), even)
+    image[rim] = [0.21, 0.2, 0.195]
+    image[disk(94 + radius, 50, radius) >= 1] = 0.125
+    mask = found_in(SCENE.noisy(image, 1), backdrop).mask
+    assert (mask[rim].mean() > 0.95) == (radius == 0)
+
+
 def test_a_hair_hangs_on_the_head() -> None:
     head = disk(60, 60, 16)
     hair = strand((60, 60), (110, 20), 0.8)
     found = found_in(shot(np.maximum(head, hair)).image)
     middle = (hair >= 0.5) & (disk(60, 60, 20) == 0)
     assert found.maybe[middle].mean() > 0.95
+
+
+def test_ground_that_a_figure_dims_is_no_figure() -> None:
+    alpha = disk(70, 50, 20)
+    even = np.full_like(SCENE.lit, 0.5)
+    backdrop = Backdrop(even, even / 4, BACKDROP.noise, BACKDROP.doubt)
+    image = np.where(disk(70, 50, 24)[..., None] > 0, even * np.float32([0.74, 0.76, 0.77]), even)
+    image = np.where(alpha[..., None] == 1, np.float32([0.05, 0.1, 0.6]), image)
+    mask = found_in(SCENE.noisy(image, 1), backdrop).mask
+    assert mask[alpha < 1].mean() < 0.001
+
+
+def test_ground_is_seen_through_a_narrow_gap() -> None:
+    alpha = disk(70, 50, 20)
+    alpha[50:75, 64:66] = 0
+    # In about the ground's colour evidence is shared across the gap.
+    mask = found_in(shot(alpha, colour=np.float32([0.5, 0.45, 0.5])).image).mask
+    assert mask[50:65, 64:66].mean() < 0.2
+    assert mask[alpha == 1].mean() > 0.99
 
 
 def test_specks_are_no_figure_and_a_pinhole_is_none_in_it() -> None:
@@ -67,7 +101,9 @@ def test_pixels_of_which_nothing_is_known_follow_their_neighbours() -> None:
     unknown[48:52, 68:72] = unknown[10:14, 10:14] = True
     image = shot(alpha).image
     image[unknown] = 0
-    mask = find_figure(image, BACKDROP, BACKDROP.nearest(image), unknown, NOTHING, KNOWN.size).mask
+    mask = find_figure(
+        image, BACKDROP, BACKDROP.nearest(image), unknown, NOTHING, KNOWN.size, REACH
+    ).mask
     assert mask[48:52, 68:72].all() and not mask[10:14, 10:14].any()
 
 

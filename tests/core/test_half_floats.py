@@ -6,7 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shadowtool.core.half_floats import all_finite, rounded, shortened, to_float, to_half
+from shadowtool.core.half_floats import (
+    all_finite,
+    not_finite,
+    rounded,
+    shortened,
+    to_float,
+    to_half,
+)
 
 EVERY_HALF = np.arange(1 << 16, dtype=np.uint32).astype(np.uint16).view(np.float16)
 SHAPES = [(1,), (4,), (1, 1), (4, 1), (1, 4), (4, 1, 3), (2, 2, 4), (3, 3, 7), (0, 3), (2, 3, 2, 2)]
@@ -96,3 +103,13 @@ def test_what_is_shortened_is_off_by_a_thirty_second_of_a_halfs_step(values):
 
 def test_every_half_stays_as_it_is_when_shortened():
     assert same_bits(shortened(to_float(EVERY_HALF)), to_float(EVERY_HALF))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_pixels_with_a_channel_that_is_not_finite_are_found(dtype: type) -> None:
+    image = np.zeros((3, 4, 3), dtype)
+    assert not_finite(image) is None
+    image[0, 1, 2], image[2, 3, 0], image[1, 0] = np.nan, -np.inf, (np.inf, np.nan, 0)
+    bad = not_finite(image)
+    assert bad is not None
+    assert np.argwhere(bad).tolist() == [[0, 1], [1, 0], [2, 3]]

@@ -78,6 +78,13 @@ def test_an_edge_that_is_soft_all_around_is_expected_to_be() -> None:
     assert (narrowed(trimap, prior, mask)[(alpha > 0.05) & (alpha < 0.8)] == UNKNOWN).all()
 
 
+def test_what_is_mixed_with_ground_is_no_sample_of_the_figure() -> None:
+    alpha = np.clip((25 - np.hypot(*np.mgrid[-50:50, -80:80])) / 6 + 0.5, 0, 1)
+    mask = alpha > 0.3
+    trimap, prior = prior_of(alpha, mask)
+    assert alpha[narrowed(trimap, prior, mask) == FIGURE].min() > 0.95
+
+
 def test_where_motion_blurs_the_edge_the_band_stays_wide() -> None:
     alpha = in_motion(lambda time: disk(77 + 5 * time, 50, 25))
     mask = alpha > 0.1

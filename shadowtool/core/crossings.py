@@ -233,10 +233,10 @@ class CrossingFinder:
         number = self._frames - len(new)
         # Darker by noise long before, and an edge that takes several frames to pass: where it
         # begins can't be told.
-        noisy = state.low[begun] < nearly_lit[fresh]
-        noisy &= number - state.at[begun] > len(seen) - 1
-        state.lost[begun] = False
-        state.lost[begun[noisy]] = _creeps_in(state, high, begun[noisy], new)
+        aged = state.low[begun] < nearly_lit[fresh]
+        aged &= number - state.at[begun] > len(seen) - 1
+        doubtful = aged | state.lost[begun]
+        _creep(state, high, begun[doubtful], aged[doubtful], new)
         # As if they had crossed in the frame before.
         last = np.full(len(begun), number - 1), seen[-1][begun], state.lower[begun]
         _search(state, begun, threshold[fresh], last, [*seen[-2:], *new], number - 2)
@@ -249,21 +249,29 @@ class CrossingFinder:
         state.lower[:], state.low[:] = lower, low
 
 
-def _creeps_in(state: _State, high: Int16, pixels: Indices, frames: Sequence[Int16]) -> Bool:
-    """Whether the threshold sinks below the crossing found last only when the pixel is darker than
-    that already: by a fall of many small steps."""
+def _creep(
+    state: _State, high: Int16, pixels: Indices, aged: Bool, frames: Sequence[Int16]
+) -> None:
+    """Lose pixels that fall by many small steps, and find those again that then fall at once.
+
+    Of the first the threshold sinks below the crossing found last only when they are darker than
+    that already.
+
+    Args:
+        aged: (P,), whose crossing found last is too long ago to look up what came after it.
+    """
     low, lit, after = state.low[pixels], high[pixels], state.after[pixels]
-    creeps, passed = np.zeros(len(pixels), bool), np.zeros(len(pixels), bool)
+    lost, passed = state.lost[pixels], np.zeros(len(pixels), bool)
     for frame in frames:
         values = frame[pixels]
         threshold = _midway(values, lit)
         darker = values < low
         falls = darker & (low >= threshold)
         slips = darker & ~falls & ~passed & (after >= threshold)
-        creeps = (creeps | slips) & ~falls
+        lost = (lost | (slips & aged)) & ~falls
         passed |= falls | slips
         np.minimum(low, values, out=low)
-    return creeps
+    state.lost[pixels] = lost
 
 
 def _search(

@@ -234,8 +234,9 @@ def _heaviness(pairs: list[tuple[Float32, Float32]], share: float, noise: NoiseM
     pairs this share is no better."""
     found = []
     for first, second in pairs:
-        sigma = noise.sigma((first + second) / 2) * np.float32(np.sqrt(2))
-        with np.errstate(invalid="ignore"):
+        # What is not finite is left out below.
+        with np.errstate(invalid="ignore", over="ignore"):
+            sigma = noise.sigma((first + second) / 2) * np.float32(np.sqrt(2))
             off = np.abs(first - second) / sigma
         parts = (
             tile.reshape(tile.shape[0] * tile.shape[1], 3)

@@ -161,3 +161,13 @@ def test_dark_levels_in_which_all_moved_do_not_raise_the_noise() -> None:
 @given(hnp.arrays(np.float32, st.integers(0, 60), elements=st.floats(-4, 4, width=16)))
 def test_values_are_put_in_the_order_of_a_stable_sort(values: np.ndarray) -> None:
     assert np.array_equal(_ascending(values), np.argsort(values, kind="stable"))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_pixel_that_is_no_number_changes_next_to_nothing(value: float) -> None:
+    shots = take(24)
+    clean = model_of(shots)
+    shots[0][0, 0] = value
+    spoilt = model_of(shots)
+    assert spoilt.slope == pytest.approx(clean.slope, rel=0.02)
+    assert spoilt.floor == pytest.approx(clean.floor, rel=0.2)

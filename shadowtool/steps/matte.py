@@ -13,7 +13,7 @@ from shadowtool.core import beta as shadow_beta
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.boxes import Box, around
 from shadowtool.core.exposure import frame_gain, without_gain
-from shadowtool.core.half_floats import to_float
+from shadowtool.core.half_floats import all_finite, to_float
 from shadowtool.core.holdout import grid_step, on_grid
 from shadowtool.core.matting import (
     HIDDEN,
@@ -24,7 +24,7 @@ from shadowtool.core.matting import (
     without_figure,
 )
 from shadowtool.core.noise import NoiseModel
-from shadowtool.core.plates import Plates, seen_pixels
+from shadowtool.core.plates import Plates
 from shadowtool.errors import OptionError
 from shadowtool.io.image import EXR, PNG, Header, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import read_plates
@@ -314,8 +314,7 @@ class _Take:
     def _shown(self, frame: Frame) -> _Shown:
         stored = self.footage.image(frame)
         light = stored.rgb(self.footage.transfer)
-        seen = seen_pixels(light, None)
-        bad = None if seen is None else ~seen
+        bad = _not_finite(light)
         gain = 1.0
         if self.gain == "auto":
             with np.errstate(invalid="ignore"):
@@ -358,6 +357,15 @@ class _Take:
             return shadow_beta.fill_beta(beta, reached, hidden, self.fill)
         planes = [beta[..., channel] for channel in range(3)]
         return np.dstack([shadow_beta.fill_beta(p, reached, hidden, self.fill) for p in planes])
+
+
+def _not_finite(light: NDArray[np.floating]) -> Bool | None:
+    """Where a channel is NaN or infinite, (H, W); None for nowhere."""
+    if light.dtype == np.float16 and all_finite(light.astype(np.float16, copy=False)):
+        return None
+    finite = np.isfinite(light)
+    bad = ~(finite[..., 0] & finite[..., 1] & finite[..., 2])
+    return bad if bad.any() else None
 
 
 def _matte_plane(path: Path) -> Float32:

@@ -121,7 +121,7 @@ def write_scan(folder: Path, scan: Pass, header: Header, provenance: Provenance)
     layers = {part.name: getattr(scan.times, part.name) for part in fields(scan.times)}
     layers |= {name: rounded(layers[name]) for name in ("error", "own_error")}
     layers["contrast"] = to_float(rounded(scan.times.contrast))
-    write_exr(folder / SCAN, layers, header, provenance)
+    write_exr(folder / SCAN, layers, header, provenance, quick=True)
     lines = scan.lines
     rows = [
         {

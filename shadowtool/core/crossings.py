@@ -249,6 +249,51 @@ class CrossingFinder:
         state.lower[:], state.low[:] = lower, low
 
 
+class SecondLook:
+    """Finds the crossings that were lost, in another reading of the pass.
+
+    Now that the threshold is known, the first frame that is below it is the crossing.
+    """
+
+    def __init__(self, found: Crossings, wanted: Bool) -> None:
+        """Args:
+        found: what `CrossingFinder` found in the same frames.
+        wanted: (H, W), pixels whose crossing is looked for.
+        """
+        self._found = found
+        self._pixels = np.flatnonzero(wanted)
+        low, high = (found.lowest.ravel(), found.highest.ravel())
+        self._threshold = _value(
+            to_keys(rounded((low[self._pixels] + high[self._pixels]) / np.float32(2)))
+        )
+        self._last = np.full(len(self._pixels), np.nan, np.float32)
+        self._before, self._after = self._last.copy(), self._last.copy()
+        self._at = np.zeros(len(self._pixels), np.int32)
+        self._open = np.ones(len(self._pixels), bool)
+        self._frames = 0
+
+    def add(self, gray: NDArray[np.floating]) -> None:
+        """Take in one frame's luminance, (H, W), in the order of the pass."""
+        values = to_float(rounded(gray).ravel()[self._pixels])
+        values = np.where(np.isfinite(values), values, self._last)
+        crossed = self._open & (values < self._threshold)
+        self._at[crossed] = self._frames
+        self._before[crossed], self._after[crossed] = self._last[crossed], values[crossed]
+        self._open &= ~crossed
+        self._last = values
+        self._frames += 1
+
+    def found(self) -> Crossings:
+        """All that is known, the end of the pass."""
+        at, lost = self._found.at.copy(), self._found.lost.copy()
+        before, after = self._found.before.copy(), self._found.after.copy()
+        seen = (self._at > 0) & np.isfinite(self._before)
+        at.ravel()[self._pixels] = np.where(seen, self._at, 0)
+        before.ravel()[self._pixels], after.ravel()[self._pixels] = self._before, self._after
+        lost.ravel()[self._pixels] = False
+        return self._found._replace(at=at, before=before, after=after, lost=lost)
+
+
 def _creep(
     state: _State, high: Int16, pixels: Indices, aged: Bool, frames: Sequence[Int16]
 ) -> None:

@@ -30,8 +30,8 @@ _MISFIT = 1.5
 # A pixel's own measurement may deviate from the plane, and the plane from that of smaller windows,
 # by this many standard deviations.
 _AGREES = 3.0
-# Of the eight pixels around a measurement so many have to agree with it, within as many units.
-_COMPANY, _NEAR = 3, 1.0
+# Of the eight pixels around a measurement so many have to agree with it.
+_COMPANY = 3
 # Slopes are held back as if each window had seen none, with this weight.
 _LEVEL = 0.1
 # No plane is known better than this.
@@ -49,10 +49,12 @@ class Windows:
     Attributes:
         radii: half their widths, pixels, ascending.
         factor: by how much a plane is known worse than from independent measurements.
+        near: by how much neighbours may differ that agree, besides what their errors explain.
     """
 
     radii: tuple[int, ...] = RADII
     factor: float = 1.0
+    near: float = 1.0
 
     @property
     def reach(self) -> int:
@@ -89,7 +91,9 @@ def fit_planes(
     """
     known = np.isfinite(value) & np.isfinite(error)
     variance = np.where(known, error, 1).astype(np.float64) ** 2
-    trusted = known & _in_company(np.where(known, value, np.float32(np.nan)), variance)
+    trusted = known & _in_company(
+        np.where(known, value, np.float32(np.nan)), variance, windows.near
+    )
     measured = np.where(known, value, 0).astype(np.float64)
     weight = np.where(trusted, 1 / np.maximum(variance, 1e-12), 0)
     first, last, _ = wanted.indices(len(value))
@@ -114,7 +118,7 @@ def fit_planes(
     return best, np.sqrt(spread, out=spread)
 
 
-def _in_company(value: Float32, variance: Float64) -> Bool:
+def _in_company(value: Float32, variance: Float64, near: float) -> Bool:
     """Where enough of the eight pixels around agree with a measurement; NaN agrees with none."""
     company = np.zeros(value.shape, np.uint8)
     variance = variance.astype(np.float32)
@@ -123,7 +127,7 @@ def _in_company(value: Float32, variance: Float64) -> Bool:
         here, there = _overlap(value.shape, dy, dx)
         allowed = np.sqrt(variance[here] + variance[there])
         allowed *= np.float32(_AGREES)
-        allowed += np.float32(_NEAR)
+        allowed += np.float32(near)
         agrees = np.abs(value[here] - value[there]) < allowed
         company[here] += agrees
         company[there] += agrees

@@ -4,7 +4,7 @@ An edge sharper than its own step falls between two frames; where, only those pi
 frame caught half-way. How long the edge takes to pass a pixel is told by how many were caught.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -39,8 +39,16 @@ _ARRAYS, _SLOPE_ROWS, _USUAL = 12, 256, 100_000
 _PROFILE, _LEAST_ERROR = 0.1, 0.01
 # From the first duration on, in frames, to the second, interpolation between the frames takes over.
 _SHARP, _SOFT = 0.6, 1.0
+# From how many frames on an edge's duration is told by its fall, and up to how many; how large a
+# fall noise makes by itself where it chooses the frame, in standard deviations.
+_LONG, _LONGEST, _CHOSEN = 2.5, 100.0, 1.5
 # Standard deviation of a time of which only the interval between two frames is known.
 INTERVAL_ERROR = 1 / np.sqrt(12)
+# Steps of so many times the usual one are from one thing to another; and on one thing times differ
+# from pixel to pixel by so many times their slope on the plane.
+_OTHER, _SLOPED = 3.0, 1.5
+# Noise moves a time by up to so many of its standard deviations.
+_MOVED = 3.0
 # Half the widths of the windows in which times are taken for linear, pixels.
 _RADII = (2, 5)
 _WINDOWS = Windows(_RADII)
@@ -129,14 +137,15 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
     these the visibility v tells the time: t = f + τ(v - ½). Of all others nothing is known but
     the interval. τ follows from the sum of v(1 - v) over a pixel's frames, which for a straight
     flank is τ/6 in the mean. Edges that take longer are on their way in both frames, and
-    interpolation between them is right.
+    interpolation between them is right; how long they take, and so how far noise moves the time,
+    is told by how little of the light is lost from one of the two frames to the other.
 
     Returns:
         Positions among the frames and their standard deviations, in frames; (H, W) float32 each,
         NaN and infinite where unknown.
     """
     known = crossings.at > 0
-    lost, left, passing = (np.empty(known.shape, np.float32) for _ in range(3))
+    lost, left, passing, fall = (np.empty(known.shape, np.float32) for _ in range(4))
     counts = np.zeros((2, _BINS))
     cuts = list(bands(known.shape, _ARRAYS))
     for rows in cuts:
@@ -148,6 +157,10 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
             count += _counts(seen, known[rows])
             # Not caught is as good as not on its way.
             np.multiply(seen, known[rows] & (seen > _CAUGHT * sigma), out=values[rows])
+        # Where an edge falls by less than the noise from frame to frame, noise chooses the frame.
+        chosen = (_CHOSEN / 2) * (sigmas[0] + sigmas[1])
+        between = np.fmax((part.before - part.after) / contrast, 0) ** 2 - chosen**2
+        np.multiply(np.sqrt(np.maximum(between, 0)), known[rows], out=fall[rows])
     least = [np.float32(_least_caught(count)) for count in counts]
     for rows in cuts:
         total = passing[rows]
@@ -155,11 +168,14 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
         for values, enough in zip((lost[rows], left[rows]), least, strict=True):
             values *= values > enough
             total += values * (1 - values)
-    duration = _local_mean(passing, known)
+    duration = 6 * _local_mean(passing, known)
+    longer = 1 / np.maximum(_local_mean(fall, known), np.float32(1 / _LONGEST))
+    # Two frames tell of no more than three.
+    np.copyto(duration, longer, where=(longer > _LONG) & (duration > 1))
     time, error = np.empty_like(lost), np.empty_like(lost)
     for rows in cuts:
         caught = lost[rows], left[rows]
-        told = _told(crossings.part(rows), noise, caught, 6 * duration[rows])
+        told = _told(crossings.part(rows), noise, caught, duration[rows])
         time[rows] = np.where(known[rows], told[0], np.float32(np.nan))
         error[rows] = np.where(known[rows], told[1], np.float32(np.inf))
     return time, error
@@ -234,13 +250,16 @@ def time_windows(time: Float32, plane: Bool) -> Windows:
         (above, below, inside & inside_below),
         (above[:, :-1], above[:, 1:], inside[:, :-1] & inside[:, 1:]),
     ):
-        slope = second - first
-        # Larger steps are from one thing to another.
-        with np.errstate(invalid="ignore"):
-            slope = slope[both & (np.abs(slope) < 2)]
+        slope = (second - first)[both]
+        slope = slope[np.isfinite(slope)]
+        if slope.size:
+            # Larger steps are from one thing to another.
+            usual = float(np.median(np.abs(slope)))
+            slope = slope[np.abs(slope) < max(2, _OTHER * usual)]
         slopes.append(float(slope.mean()) if slope.size else 0.0)
     steepest = float(np.hypot(slopes[0], slopes[1]))
-    return Windows.for_step(1 / steepest if steepest > 0 else 0.0, _RADII)
+    windows = Windows.for_step(1 / steepest if steepest > 0 else 0.0, _RADII)
+    return replace(windows, near=max(1.0, _SLOPED * steepest))
 
 
 def refined_times(
@@ -250,7 +269,8 @@ def refined_times(
     windows: Windows = _WINDOWS,
     wanted: slice = slice(None),
 ) -> tuple[Float32, Float32]:
-    """Times as the pixels around tell them too, each within its own interval between two frames.
+    """Times as the pixels around tell them too, each within its own interval between two frames, or
+    as far beyond it as noise may have moved it.
 
     Args:
         time, error: (H, W) float32 from `own_times`.
@@ -263,8 +283,9 @@ def refined_times(
         wanted.
     """
     fitted, spread = fit_planes(time, error, windows, wanted)
-    late = at[wanted].astype(np.float32)
-    return np.clip(fitted, late - 1, late, out=fitted), spread
+    late, own = at[wanted].astype(np.float32), error[wanted]
+    beyond = np.where(own > INTERVAL_ERROR, np.float32(_MOVED) * own, np.float32(0))
+    return np.clip(fitted, late - 1 - beyond, late + beyond, out=fitted), spread
 
 
 def usual_loss(contrast: Float32, highest: Float32, known: Bool, plane: Bool) -> Float32:

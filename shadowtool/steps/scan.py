@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Gain
 from shadowtool.core.bands import overlapping_bands
-from shadowtool.core.crossings import CrossingFinder, Crossings
+from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
 from shadowtool.core.exposure import RunningGain, sampled_areas
 from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
@@ -64,6 +64,8 @@ PICTURE = "scan.png"
 _BENT, _CERTAIN = 1.0, 6.0
 # A sweep reaches little of the frame, and is fast: a part of the frame, pixels a frame.
 _LITTLE, _FAST = 0.5, 20.0
+# If more of the frame than this can't be told from one reading, the frames are read again.
+_LOST = 0.05
 
 
 def scan(
@@ -206,7 +208,27 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
     if len(gains) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
     noise = noise_model(noise_levels(thinned))
-    return _Reading(significant(finder.found(), noise), noise, marks, gains, first)
+    crossings = significant(finder.found(), noise)
+    if crossings.lost.mean() > _LOST:
+        crossings = _looked_at_again(footage, crossings, gains, run)
+    return _Reading(crossings, noise, marks, gains, first)
+
+
+def _looked_at_again(
+    footage: Footage, crossings: Crossings, gains: dict[Frame, float], run: Run
+) -> Crossings:
+    """With what one reading lost, because an edge took long to pass, or noise is large."""
+    look = SecondLook(crossings, crossings.lost)
+
+    def read(frame: Frame) -> Float16:
+        return luminance_halfs(footage.read(frame))
+
+    for done, (gray, own) in enumerate(
+        zip(ordered_map(read, gains, run.jobs), gains.values(), strict=True), start=1
+    ):
+        look.add(gray if own == 1 else to_float(gray) / np.float32(own))
+        run.progress(done, len(gains))
+    return look.found()
 
 
 def _times(

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowtool.core.crossings import LEAST_CONTRAST, CrossingFinder
+from shadowtool.core.crossings import LEAST_CONTRAST, CrossingFinder, SecondLook
 
 
 def crossings_in_two_readings(grays: list[np.ndarray]) -> tuple[np.ndarray, ...]:
@@ -91,3 +91,30 @@ def test_what_noise_darkened_before_an_edge_creeps_in_is_lost(start: int) -> Non
             finder.add(np.full((1, 1), dip if number == 3 else gray))
         lost[dip] = bool(finder.found().lost.all())
     assert lost == {1.0: False, 0.955: True}
+
+
+def test_a_second_look_finds_what_the_first_lost() -> None:
+    rng = np.random.default_rng(0)
+    arrival = rng.uniform(-20, 220, (12, 15))
+    grays = []
+    for number in range(200):
+        lit = 1 - np.clip((number - arrival) / 60 + 0.5, 0, 1)
+        gray = 0.15 + 0.85 * lit + rng.normal(scale=0.03, size=lit.shape)
+        gray[rng.uniform(size=gray.shape) < 0.02] = np.nan
+        grays.append(gray.astype(np.float32))
+    finder = CrossingFinder()
+    for gray in grays:
+        finder.add(gray)
+    first = finder.found()
+    assert first.lost.mean() > 0.5
+    look = SecondLook(first, first.lost)
+    for gray in grays:
+        look.add(gray)
+    found = look.found()
+    at, before, after = crossings_in_two_readings(grays)
+    assert not found.lost.any()
+    assert np.array_equal(found.at, at)
+    assert np.array_equal(found.before[at > 0], before[at > 0])
+    assert np.array_equal(found.after[at > 0], after[at > 0])
+    # The first's own answer is left as it was.
+    assert (first.at[first.lost] == 0).all()

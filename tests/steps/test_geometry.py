@@ -92,6 +92,23 @@ def test_light_that_changes_moves_no_time(scans: list[Path], tmp_path: Path, mas
     assert off["corrected"] < off["as-is"] / 3
 
 
+@pytest.mark.parametrize(("speed", "soft"), [(0.5, 2.0), (0.8, 30.0)])
+def test_a_slow_sweep_of_a_soft_edge_is_followed(
+    tmp_path: Path, mask: str, speed: float, soft: float
+) -> None:
+    sweep = Sweep(0.3, speed=speed, soft=soft, width=30.0)
+    scan(shoot(tmp_path / "frames", sweep), tmp_path / "scan", plane=mask)
+    found = read_scan(tmp_path / "scan")[0]
+    assert np.isfinite(found.times.time).mean() > 0.95
+    normal, offset = SCENE.edge(sweep, 0)
+    true = (SCENE.warp @ normal + offset) / speed + 1001
+    late = (found.times.time - true)[SCENE.plane]
+    # Noise makes all pixels cross a little early, and the lines with them.
+    early = np.nanmedian(late)
+    assert -0.3 < early * speed < 0.1
+    assert np.nanpercentile(np.abs(late - early), 90) * speed < 0.15
+
+
 def test_a_source_that_stands_like_the_target_needs_no_map(
     scans: list[Path], tmp_path: Path
 ) -> None:

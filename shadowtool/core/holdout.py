@@ -21,9 +21,8 @@ UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
-# The grid has about this many columns; so many frames are its samples.
+# The grid has about this many columns.
 _COLUMNS = 320
-SAMPLES = 24
 # A sample lies on a line within this many standard deviations, of its noise and this part of its
 # value together.
 _ON_LINE, _TOLERANCE = 4.0, 0.01

@@ -30,7 +30,7 @@ Index = NDArray[np.intp]
 Window = tuple[slice, slice]
 
 # A sample of this many frames tells the lit level.
-SAMPLES = 24
+SAMPLES = 28
 # So many of the brightest samples may be outliers.
 _OUTLIERS = 2
 # The expected place of the third highest of some two dozen lit samples, standard deviations.

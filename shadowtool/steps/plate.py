@@ -58,7 +58,7 @@ Bool = NDArray[np.bool_]
 HOLDOUT_FOLDER = "holdout"
 # Sampled frames are kept for the second reading up to so many bytes, as far as these with what the
 # estimate takes for each pixel stay below a gigabyte.
-_KEPT, _WITH_ESTIMATE, _PER_PIXEL = 400 << 20, 1000 << 20, 100
+_KEPT, _WITH_ESTIMATE, _PER_PIXEL = 500 << 20, 1000 << 20, 100
 _NOTHING = np.zeros((0, 0, 3), np.float16)
 _NO_GRID = np.zeros((0, 0, 3), np.float32)
 

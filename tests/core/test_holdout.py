@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shadowtool.core.holdout import (
-    SAMPLES,
     Background,
     figure_mask,
     find_background,
@@ -17,6 +16,7 @@ from shadowtool.core.holdout import (
     on_grid,
 )
 from shadowtool.core.noise import NoiseModel
+from shadowtool.core.robust_plates import SAMPLES
 from tests.scene import Scene, smoothstep
 
 WIDTH, HEIGHT = 240, 135

@@ -47,14 +47,25 @@ class Figure(NamedTuple):
     trimap: UInt8
 
 
+def differs(image: Float32, backdrop: Backdrop, unknown: Bool) -> Bool:
+    """Where a frame, or some rows of it, is not plainly lit ground, (H, W); arguments as for
+    `pull_figure`."""
+    seen, _, _ = _without_unknown(image, backdrop, unknown)
+    return changed(seen, backdrop)
+
+
 def pull_figure(
     image: Float32,
     backdrop: Backdrop,
     unknown: Bool,
     drawn: UInt8 | None = None,
     hint: UInt8 | None = None,
+    frame_size: tuple[int, int] | None = None,
 ) -> Figure:
     """The figure in a frame, its alpha, colour and trimap.
+
+    All arguments may be of a part of the frame that holds all in which it `differs`, and a margin
+    of `MARGIN`.
 
     Args:
         image: (H, W, 3) float32, linear light; where it is not finite it is unknown.
@@ -62,15 +73,15 @@ def pull_figure(
         drawn: (H, W) uint8, a trimap from elsewhere whose 0 and 255 are kept; what is 128 in it is
             found as without one.
         hint: (H, W) uint8, a trimap that may be a little off, for what the frame leaves open.
+        frame_size: height and width of the whole frame, if this is a part.
 
     Returns:
         The figure; empty if there is none, black where the frame is unknown.
     """
-    height, width = image.shape[:2]
-    alpha = np.zeros((height, width), np.float32)
-    foreground = np.zeros((height, width, 3), np.float32)
+    height, width = frame_size or image.shape[:2]
+    alpha, foreground = np.zeros(image.shape[:2], np.float32), np.zeros(image.shape, np.float32)
     if drawn is None:
-        drawn = np.full((height, width), UNKNOWN, np.uint8)
+        drawn = np.full(alpha.shape, UNKNOWN, np.uint8)
     trimap = np.where(drawn == FIGURE, FIGURE, BACKGROUND)
     seen, unknown, bad = _without_unknown(image, backdrop, unknown)
     box = around(changed(seen, backdrop) | (trimap == FIGURE), MARGIN)

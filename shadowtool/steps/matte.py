@@ -1,6 +1,7 @@
 """The shadow matte β and the figure's matte, frame by frame."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from shadowtool.choices import Beta, Fill, Gain, Only
 from shadowtool.core import beta as shadow_beta
 from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.boxes import Box, around
 from shadowtool.core.exposure import frame_gain, without_gain
 from shadowtool.core.half_floats import not_finite, to_float
@@ -18,13 +20,14 @@ from shadowtool.core.holdout import grid_step, on_grid
 from shadowtool.core.matting import (
     HIDDEN,
     MARGIN,
-    Figure,
     colour_figure,
+    differs,
     pull_figure,
     without_figure,
 )
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.plates import Plates
+from shadowtool.core.trimap import FIGURE
 from shadowtool.errors import OptionError
 from shadowtool.io.image import EXR, PNG, Header, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import read_plates
@@ -281,19 +284,14 @@ class _Take:
             "gain": round(shown.gain, 6),
         }
         marked = with_figures(provenance, figures)
-        if "alpha" in self.wanted:
-            rgba = np.zeros((*hidden.shape, 4), np.float16)
-            rgba[figure.box][..., :3] = to_half(figure.foreground)
-            rgba[..., 3] = to_half(figure.alpha)
-            write_exr(self._file("alpha", frame), {"RGBA": rgba}, shown.header, marked)
-        if "beta" in self.wanted:
-            confidence = self.scene.confidence.copy()
-            seen = 1 - figure.alpha[figure.box]
-            confidence[figure.box] = to_half(to_float(confidence[figure.box]) * seen)
-            confidence[unknown] = 0
-            name = "Y" if self.beta == "scalar" else "RGB"
-            layers = {name: to_half(self._filled(beta, hidden)), "confidence": confidence}
-            write_exr(self._file("beta", frame), layers, shown.header, marked)
+        products: tuple[tuple[Only, Callable[[], dict[str, NDArray[np.float16]]]], ...] = (
+            ("alpha", lambda: _figure_layers(figure)),
+            ("beta", lambda: self._beta_layers(beta, hidden, unknown, figure)),
+        )
+        # One after the other, so that no two are held at once.
+        for product, layers in products:
+            if product in self.wanted:
+                write_exr(self._file(product, frame), layers(), shown.header, marked)
         return figures
 
     def summary(self, rows: list[Figures]) -> Figures:
@@ -329,21 +327,43 @@ class _Take:
             image = shown.at(box)
             figure = colour_figure(image, backdrop, unknown, alpha[box])
             return _Figure(alpha, None, box, figure.foreground, without_figure(image, figure))
-        image = shown.at(Box(slice(None), slice(None)))
-        figure = self._pulled(frame, image)
-        box = around(figure.alpha > 0, 0) or _NONE
-        part = Figure(figure.foreground[box], figure.alpha[box], figure.trimap[box])
-        ground = without_figure(image[box], part)
-        return _Figure(figure.alpha, figure.trimap, box, part.foreground, ground)
+        return self._pulled(frame, shown)
 
-    def _pulled(self, frame: Frame, image: Float32) -> Figure:
-        backdrop, unknown = self.scene.backdrop, self.scene.unknown
-        if self.keyframes is None:
-            return pull_figure(image, backdrop, unknown)
-        trimap = self.keyframes.trimap(frame)
-        if frame not in self.keyframes.drawn.files:
-            return pull_figure(image, backdrop, unknown, hint=trimap)
-        return pull_figure(image, backdrop, unknown, trimap)._replace(trimap=trimap)
+    def _pulled(self, frame: Frame, shown: _Shown) -> _Figure:
+        given = None if self.keyframes is None else self.keyframes.trimap(frame)
+        drawn = self.keyframes is not None and frame in self.keyframes.drawn.files
+        mask = self._differs(shown)
+        if drawn and given is not None:
+            mask |= given == FIGURE
+        alpha, trimap = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.uint8)
+        made = given if drawn else trimap
+        box = around(mask, MARGIN)
+        if box is None:
+            nothing = np.zeros((0, 0, 3), np.float32)
+            return _Figure(alpha, made, _NONE, nothing, nothing)
+        image, part = shown.at(box), None if given is None else given[box]
+        figure = pull_figure(
+            image,
+            self.scene.backdrop.at(box),
+            self.scene.unknown[box],
+            drawn=part if drawn else None,
+            hint=None if drawn else part,
+            frame_size=mask.shape,
+        )
+        alpha[box], trimap[box] = figure.alpha, figure.trimap
+        ground = without_figure(image, figure)
+        return _Figure(alpha, made, box, figure.foreground, ground)
+
+    def _differs(self, shown: _Shown) -> Bool:
+        """Where a frame is not plainly lit ground, a few rows at a time."""
+        height, width = self.scene.unknown.shape
+        found = np.empty((height, width), bool)
+        for rows, inner in overlapping_bands(height, 1):
+            box = Box(rows, slice(0, width))
+            backdrop, unknown = self.scene.backdrop.at(box), self.scene.unknown[box]
+            part = differs(shown.at(box), backdrop, unknown)
+            found[rows][inner] = part[inner]
+        return found
 
     def _beta(self, shown: _Shown, figure: _Figure, hidden: Bool) -> Float32:
         """β (H, W) or (H, W, 3), NaN where it was not measured."""
@@ -351,12 +371,29 @@ class _Take:
         ground = (figure.box, figure.ground)
         return self.scene.gauge.measure(shown.light, unseen, shown.gain, ground, self.clamp)
 
+    def _beta_layers(
+        self, beta: Float32, hidden: Bool, unknown: Bool, figure: _Figure
+    ) -> dict[str, NDArray[np.float16]]:
+        confidence = self.scene.confidence.copy()
+        seen = 1 - figure.alpha[figure.box]
+        confidence[figure.box] = to_half(to_float(confidence[figure.box]) * seen)
+        confidence[unknown] = 0
+        name = "Y" if self.beta == "scalar" else "RGB"
+        return {name: to_half(self._filled(beta, hidden)), "confidence": confidence}
+
     def _filled(self, beta: Float32, hidden: Bool) -> Float32:
         reached = self.scene.never_reached
         if beta.ndim == 2:
             return shadow_beta.fill_beta(beta, reached, hidden, self.fill)
         planes = [beta[..., channel] for channel in range(3)]
         return np.dstack([shadow_beta.fill_beta(p, reached, hidden, self.fill) for p in planes])
+
+
+def _figure_layers(figure: _Figure) -> dict[str, NDArray[np.float16]]:
+    rgba = np.zeros((*figure.alpha.shape, 4), np.float16)
+    rgba[figure.box][..., :3] = to_half(figure.foreground)
+    rgba[..., 3] = to_half(figure.alpha)
+    return {"RGBA": rgba}
 
 
 def _matte_plane(path: Path) -> Float32:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.filling import fill_membrane
+from shadowtool.core.transfer import LUMA
 from shadowtool.core.trimap import FIGURE, UNKNOWN, Prior
 
 Float32 = NDArray[np.float32]
@@ -31,8 +32,8 @@ Bool = NDArray[np.bool_]
 # what part of it there may be more or less light.
 _COLOUR, _LEAST_COLOUR = 0.04, 0.002
 _SHADING = 0.25
-# In compressed footage colours are coarser than luma (Rec.709): their alpha is so far from its own.
-_LUMA, _FRINGE = np.array([0.2126, 0.7152, 0.0722], np.float32), 0.15
+# In compressed footage colours are coarser than luma: their alpha is so far from its own.
+_FRINGE = 0.15
 # Once alpha is known, how far the pixel's own may be.
 _OWN_COLOUR = 0.6
 # How far β is from that of the ground around where that is even.
@@ -321,7 +322,7 @@ def _most_probable(
     contrast, above = pixels.figure - pixels.behind, pixels.seen - pixels.behind
     shift, shading = pixels.shift, pixels.shading
     colour = _colour_variance(pixels.figure)
-    fringe = np.float32(pixels.fringe) * (contrast - np.tensordot(_LUMA, contrast, 1))
+    fringe = np.float32(pixels.fringe) * (contrast - np.tensordot(LUMA, contrast, 1))
     fixed = pixels.noise + fringe**2
     alpha = np.broadcast_to(mean, contrast.shape[1:])
     for _ in range(_ROUNDS):

@@ -16,12 +16,10 @@ from shadowtool.core.crossings import LEAST_CONTRAST, Crossings
 from shadowtool.core.half_floats import rounded, to_float
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plane_fits import Windows, fit_planes
+from shadowtool.core.transfer import LUMA
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
-
-# Rec.709 luminance.
-LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 # A value between dark and lit was caught on its way if it is off both by so many standard
 # deviations, and by a part of the contrast, this one at least: light flickers, and a codec's errors

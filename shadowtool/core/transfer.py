@@ -14,6 +14,9 @@ from shadowtool.core.half_floats import to_float
 
 Float32 = NDArray[np.float32]
 
+# What R, G and B add to luminance (Rec. ITU-R BT.709).
+LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
+
 
 def _mirrored(curve: Callable[[Float32], Float32], values: NDArray[np.floating]) -> Float32:
     single = to_float(np.asarray(values))

@@ -149,11 +149,12 @@ class Footage:
 
 
 def make_footage(folder: Path, size: tuple[int, int], frames: int) -> Footage:
-    """``take``, its ``alpha``, ``fg`` and ``beta``; ``plates``; ``warp.exr``; ``plane.png``."""
+    """``take``, the shadow alone; ``acted``, the figure in front of it; its ``alpha``, ``fg`` and
+    ``beta``; ``plates``; ``warp.exr``; ``plane.png``."""
     width, height = size
     header = Header(width, height)
     lit, shadow = surface(width, height)
-    for part in ("take", "alpha", "fg", "beta", "plates"):
+    for part in ("take", "acted", "alpha", "fg", "beta", "plates"):
         (folder / part).mkdir(parents=True, exist_ok=True)
 
     def make(number: int) -> None:
@@ -165,6 +166,8 @@ def make_footage(folder: Path, size: tuple[int, int], frames: int) -> Footage:
         name = f"{FIRST + number}.exr"
         figure = alpha[..., None] * np.float32(0.3)
         write_exr(folder / "take" / f"take.{name}", {"RGB": (clean + grain).astype("f2")}, header)
+        acted = (clean * (1 - alpha[..., None]) + figure + grain).astype("f2")
+        write_exr(folder / "acted" / f"acted.{name}", {"RGB": acted}, header)
         write_exr(folder / "alpha" / f"alpha.{name}", {"Y": alpha.astype("f2")}, header)
         rgba = np.dstack([figure * (1 + grain), alpha]).astype("f2")
         write_exr(folder / "fg" / f"fg.{name}", {"RGBA": rgba}, header)
@@ -308,9 +311,9 @@ def figure(stage: Stage) -> Row:
     # Where the figure is all in the picture.
     first = FIRST + stage.footage.frames // 2
     numbers = [str(first + i) for i in range(6)]
-    words = ["matte", stage.path("take"), "--plates", stage.path("plates")]
+    words = ["matte", stage.path("acted"), "--plates", stage.path("plates")]
     script = str(Path(__file__).with_name("closed_form.py"))
-    peer = [sys.executable, script, stage.path("take"), stage.path("alpha"), *numbers]
+    peer = [sys.executable, script, stage.path("acted"), stage.path("alpha"), *numbers]
     absent = "" if importlib.util.find_spec("pymatting") else "pymatting is not installed"
     return Row(
         "matte, all of it",

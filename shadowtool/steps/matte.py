@@ -391,8 +391,9 @@ class _Take:
 
 def _figure_layers(figure: _Figure) -> dict[str, NDArray[np.float16]]:
     rgba = np.zeros((*figure.alpha.shape, 4), np.float16)
-    rgba[figure.box][..., :3] = to_half(figure.foreground)
-    rgba[..., 3] = to_half(figure.alpha)
+    # What is never written to takes no memory.
+    part = rgba[figure.box]
+    part[..., :3], part[..., 3] = to_half(figure.foreground), to_half(figure.alpha[figure.box])
     return {"RGBA": rgba}
 
 

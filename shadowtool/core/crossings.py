@@ -262,10 +262,8 @@ class SecondLook:
         """
         self._found = found
         self._pixels = np.flatnonzero(wanted)
-        low, high = (found.lowest.ravel(), found.highest.ravel())
-        self._threshold = _value(
-            to_keys(rounded((low[self._pixels] + high[self._pixels]) / np.float32(2)))
-        )
+        low, high = (plane.ravel()[self._pixels] for plane in (found.lowest, found.highest))
+        self._threshold = to_float(rounded((low + high) / np.float32(2)))
         self._last = np.full(len(self._pixels), np.nan, np.float32)
         self._before, self._after = self._last.copy(), self._last.copy()
         self._at = np.zeros(len(self._pixels), np.int32)

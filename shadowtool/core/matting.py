@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.boxes import around
 from shadowtool.core.detection import Found, changed, find_figure
+from shadowtool.core.half_floats import not_finite
 from shadowtool.core.known_background import colours, ground_beta, measure, solve
 from shadowtool.core.trimap import (
     BACKGROUND,
@@ -145,11 +146,9 @@ def _without_unknown(
 ) -> tuple[Float32, Bool, Bool]:
     """The frame with lit ground in place of what is unknown of it; what is unknown of either, and
     of the frame."""
-    # By channel: to reduce an axis of three is slow.
-    finite = np.isfinite(image)
-    bad = ~(finite[..., 0] & finite[..., 1] & finite[..., 2])
-    if not bad.any():
-        return image, unknown, bad
+    bad = not_finite(image)
+    if bad is None:
+        return image, unknown, np.zeros(image.shape[:2], bool)
     return np.where(bad[..., np.newaxis], backdrop.lit, image), unknown | bad, bad
 
 

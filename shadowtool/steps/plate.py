@@ -224,7 +224,6 @@ class _Take:
         background: what the automatic one goes by, once it is known; None for none.
         level: whether changes of exposure are taken out.
         reference: what exposure is measured against, on its grid; None until it is known.
-        kept: frames that have been read already, and their fingerprints.
         kept: sampled frames that need not be read again.
         known_gains: of the sampled frames.
         gains: of the frames that were used, where they are not 1.

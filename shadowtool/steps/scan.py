@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from shadowtool.choices import Gain
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
-from shadowtool.core.exposure import RunningGain, sampled_areas
-from shadowtool.core.half_floats import to_float
+from shadowtool.core.exposure import RunningGain, sampled_areas, without_gain
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.pictures import display, time_picture
 from shadowtool.core.shadow_lines import (
@@ -198,12 +197,12 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
             gray, areas, sample, picture, mark = item
             first = first if picture is None else picture
             own = exposure.add(areas) if gain == "auto" else 1.0
-            finder.add(gray if own == 1 else to_float(gray) / np.float32(own))
+            finder.add(without_gain(gray, own))
             marks.append(mark)
             gains[frames[position]] = own
             if sample is not None:
-                sample = sample if own == 1 else sample / np.float32(own)
-                thinned |= {n: sample for n, where in samples.items() if where == position}
+                level = without_gain(sample, own)
+                thinned |= {n: level for n, where in samples.items() if where == position}
         run.progress(position + 1, len(frames))
     if len(gains) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
@@ -226,7 +225,7 @@ def _looked_at_again(
     for done, (gray, own) in enumerate(
         zip(ordered_map(read, gains, run.jobs), gains.values(), strict=True), start=1
     ):
-        look.add(gray if own == 1 else to_float(gray) / np.float32(own))
+        look.add(without_gain(gray, own))
         run.progress(done, len(gains))
     return look.found()
 

@@ -3,7 +3,13 @@
 
 def main() -> None:
     """Entry point of the ``shadowtool`` program; ends the process."""
+    import os
     import signal
+
+    # Read when numpy is first imported. Sums that its linear algebra splits among threads differ
+    # in their last bits from machine to machine, and idle threads of its own only take time.
+    for library in ("OPENBLAS", "MKL", "BLIS"):
+        os.environ[f"{library}_NUM_THREADS"] = "1"
 
     # Until our own handler is there, Python's would show where in an import it was interrupted.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:

@@ -1,7 +1,8 @@
-"""Signals reach the command, whatever Python is doing when they arrive."""
+"""Signals reach the command, whatever Python is doing; its sums don't depend on the machine."""
 
 import os
 import signal
+import subprocess
 import sys
 import time
 import weakref
@@ -67,3 +68,19 @@ def test_other_things_that_cannot_be_raised_are_still_shown(capsys):
     del thing
     assert reference() is None
     assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+def test_linear_algebra_runs_on_one_thread_whatever_the_machine_has():
+    script = """
+import os
+import shadowtool.cli.process as process
+def count():
+    import numpy
+    print(len(os.listdir("/proc/self/task")))
+process.run_process = count
+from shadowtool.cli import main
+main()
+"""
+    variables = {**os.environ, "OPENBLAS_NUM_THREADS": "4"}
+    done = subprocess.run([sys.executable, "-c", script], env=variables, capture_output=True)
+    assert done.stdout == b"1\n"

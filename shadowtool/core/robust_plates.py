@@ -3,12 +3,12 @@
 The maximum of noisy samples is too bright and the minimum too dark. Here a pixel's lit value is
 the mean of all the frames in which it was lit, and its shadow value the mean of the darkest group
 of frames that agree within the noise. Two readings, in memory that does not grow with the frames:
-`LitLevels` looks at a sample of frames for the level to tell lit from shaded by, `RobustPlates` at
-all of them.
+`SampledLevels` looks at a sample of frames for the levels to tell lit from shaded by,
+`RobustPlates` at all of them.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -28,6 +28,7 @@ Int16 = NDArray[np.int16]
 Bool = NDArray[np.bool_]
 Index = NDArray[np.intp]
 Window = tuple[slice, slice]
+Value = TypeVar("Value", np.int16, np.float32)
 
 # A sample of this many frames tells the lit level.
 SAMPLES = 28
@@ -95,17 +96,38 @@ def hide(gray: Int16, where: Bool) -> None:
     np.copyto(gray, _UNSEEN, where=where)
 
 
-class LitLevels:
-    """The level at which each pixel is lit: the third highest of a sample of frames."""
+class Levels(NamedTuple):
+    """What a sample of frames says of each pixel: gray keys, (H, W) int16.
+
+    Attributes:
+        lit: the third highest.
+        darkest: the lowest.
+        shaded: the third lowest.
+    """
+
+    lit: Int16
+    darkest: Int16
+    shaded: Int16
+
+
+class SampledLevels:
+    """The three highest and the three lowest gray keys of each pixel in a sample of frames."""
 
     def __init__(self, height: int, width: int) -> None:
         shape = height, width
         self._highest = [np.full(shape, _LOWEST_KEY, np.int16) for _ in range(_OUTLIERS + 1)]
+        self._lowest = [np.full(shape, _UNSEEN, np.int16) for _ in range(_OUTLIERS + 1)]
 
     def add(self, gray: Int16) -> None:
         """Take in the gray keys of one of the sample's frames, (H, W)."""
         for start in range(0, len(gray), _ROWS):
             rows = slice(start, start + _ROWS)
+            own = gray[rows]
+            for lowest in self._lowest:
+                held = lowest[rows]
+                higher = np.maximum(held, own)
+                np.minimum(held, own, out=held)
+                own = higher
             own = gray[rows]
             if own.max() == _UNSEEN:
                 own = np.where(own == _UNSEEN, _LOWEST_KEY, own)
@@ -115,12 +137,13 @@ class LitLevels:
                 np.maximum(held, own, out=held)
                 own = lower
 
-    def levels(self) -> Int16:
-        """(H, W) keys; where fewer frames than that saw the pixel, the lowest of those."""
-        level = self._highest[-1]
+    def levels(self) -> Levels:
+        """What was found; where fewer than three frames saw the pixel, ``lit`` is the lowest of
+        those, and ``shaded`` above all that is seen."""
+        lit = self._highest[-1]
         for brighter in reversed(self._highest[:-1]):
-            level = np.where(level == _LOWEST_KEY, brighter, level)
-        return level
+            lit = np.where(lit == _LOWEST_KEY, brighter, lit)
+        return Levels(lit, self._lowest[0], self._lowest[-1])
 
 
 @dataclass(frozen=True)
@@ -217,25 +240,43 @@ class _Group:
 
 
 class RobustPlates:
-    """Means of the lit and of the fully shaded frames of each pixel."""
+    """Means of the lit and of the fully shaded frames of each pixel.
 
-    def __init__(self, levels: Int16, noise: NoiseModel) -> None:
-        """Args: the lit levels of the first reading, (H, W), and the take's noise."""
-        bits = np.ascontiguousarray(levels).view(np.uint16)
+    Where three frames of the sample agree on the darkest level, frames about it are shaded, and
+    only what is darker still has to found groups.
+    """
+
+    def __init__(self, levels: Levels, noise: NoiseModel) -> None:
+        """Args: the levels of the first reading, and the take's noise."""
         tables = _thresholds(noise)
-        self._lit_low, self._lit_high, self._dark, near = (
-            np.asarray(cv2.LUT(bits, table)) for table in tables
+        height, width = levels.lit.shape
+        self._lit_low, self._lit_high, self._dark = (
+            _looked_up(table, levels.lit) for table in (tables.low, tables.high, tables.dark)
         )
-        self._near = np.asarray(near, np.float32)
-        height, width = levels.shape
+        self._near = _looked_up(tables.near, levels.lit)
+        # From the least to the highest key of what is shaded; nothing is where that is not known.
+        self._shaded_low, self._shaded_high = (np.empty((height, width), np.int16) for _ in "01")
+        # Below this, frames found groups or join them.
+        self._deep = np.empty((height, width), np.int16)
+        for start in range(0, height, _ROWS):
+            rows = slice(start, start + _ROWS)
+            dark, shaded = self._dark[rows], levels.shaded[rows].astype(np.int32)
+            reach = _looked_up(tables.reach, levels.shaded[rows])
+            known = (shaded < dark) & (shaded - levels.darkest[rows] <= reach)
+            low = np.maximum(shaded - reach, -32767)
+            self._shaded_low[rows] = np.where(known, low, 1)
+            self._shaded_high[rows] = np.where(known, np.minimum(shaded + reach, dark - 1), 0)
+            self._deep[rows] = np.where(known, low, dark)
         # OpenCV's new arrays cost more than what is worked out in them.
         self._mask = np.empty((_ROWS, width), np.uint8)
         self._total = np.zeros((height, width, 3), np.float32)
         self._count = np.zeros((height, width), np.int32)
+        # The next group is that of what is shaded where that is known.
         self._lowest, self._next = _Group(height, width), _Group(height, width)
 
     def add(self, frame: Keyed) -> None:
         """Take in one frame; frames come in the order of the take."""
+        founding = []
         for start in range(0, len(frame.gray), _ROWS):
             rows = slice(start, start + _ROWS)
             gray = frame.gray[rows]
@@ -244,20 +285,30 @@ class RobustPlates:
             _accumulate(frame, (rows, slice(None)), self._total, lit)
             # As signed bytes the mask's 255 are -1.
             self._count[rows] -= lit.view(np.int8)
-            self._darken(frame, rows)
+            dark = gray < self._dark[rows]
+            columns = np.flatnonzero(dark.any(axis=0))
+            if columns.size:
+                window = rows, slice(int(columns[0]), int(columns[-1]) + 1)
+                founding.append(self._darken(frame, window))
+        if founding:
+            self._found(frame, np.concatenate(founding))
 
-    def _darken(self, frame: Keyed, rows: slice) -> None:
-        """Let the darkened pixels of some rows, groups of one, join, found or pass over groups."""
-        dark = frame.gray[rows] < self._dark[rows]
-        columns = np.flatnonzero(dark.any(axis=0))
-        if not columns.size:
-            return
-        window = rows, slice(int(columns[0]), int(columns[-1]) + 1)
-        part = dark[:, window[1]]
-        if np.count_nonzero(part) > _DENSE * part.size:
+    def _darken(self, frame: Keyed, window: Window) -> Index:
+        """Take in a window's darkened pixels; those that are to found groups are left over."""
+        gray = frame.gray[window]
+        shaded = cv2.inRange(gray, self._shaded_low[window], self._shaded_high[window])
+        self._next.frames[window] -= shaded.view(np.int8)
+        _accumulate(frame, window, self._next.total, np.asarray(shaded, np.uint8))
+        deep = gray < self._deep[window]
+        if np.count_nonzero(deep) > _DENSE * deep.size:
             # Most join, and are quickest added where they stand.
-            part[:] = self._lowest.join(window, frame, part, self._near)
-        where = rows.start * dark.shape[1] + np.flatnonzero(dark)
+            deep = self._lowest.join(window, frame, deep, self._near)
+        rows, columns = np.divmod(np.flatnonzero(deep), deep.shape[1])
+        place = (rows + window[0].start) * frame.gray.shape[1] + (columns + window[1].start)
+        return np.asarray(place, np.intp)
+
+    def _found(self, frame: Keyed, where: Index) -> None:
+        """Let pixels, groups of one, join, found or pass over groups."""
         where = where[~self._settled(frame, where)]
         if not where.size:
             return
@@ -268,7 +319,10 @@ class RobustPlates:
         )
         width = self._near.ravel().take(where)
         above, below, replaced = self._lowest.add(where, single, width)
-        self._next.put(where.take(below), replaced)
+        unknown = self._shaded_low.ravel().take(where) > self._shaded_high.ravel().take(where)
+        kept = np.flatnonzero(unknown.take(below))
+        self._next.put(where.take(below.take(kept)), replaced.take(kept))
+        above = above[unknown.take(above)]
         self._next.add(where.take(above), single.take(above), width.take(above))
 
     def _settled(self, frame: Keyed, where: Index) -> Bool:
@@ -287,7 +341,8 @@ class RobustPlates:
         for start in range(0, shape[0], _ROWS):
             rows = slice(start, start + _ROWS)
             lit[rows] = mean_of_keys(self._total[rows], self._count[rows][..., None])
-            where = start * shape[1] + np.flatnonzero(self._lowest.frames[rows])
+            shaded = (self._lowest.frames[rows] > 0) | (self._next.frames[rows] > 0)
+            where = start * shape[1] + np.flatnonzero(shaded)
             lowest, backup = self._lowest.at(where), self._next.at(where)
             # A group of one or two frames below a much larger one is a bird, not the shadow.
             stray = (lowest.frames < _LEAST_GROUP) & (backup.frames >= 2 * lowest.frames)
@@ -321,9 +376,25 @@ def _accumulate(frame: Keyed, window: Window, total: Float32, mask: NDArray[np.u
         cv2.accumulate(keys.view(np.uint16), sums, mask)
 
 
-def _thresholds(noise: NoiseModel) -> tuple[Int16, Int16, Int16, Float32]:
-    """By the bits of a lit level's key: the least and the highest key of what is lit, the one
-    below which it is darkened, and how far a frame may be from the group that it belongs to."""
+class _Thresholds(NamedTuple):
+    """Tables by the bits of a level's key.
+
+    Attributes:
+        low, high: (65536,) int16, the least and the highest key of what is lit, by the lit level.
+        dark: (65536,) int16, the key below which it is darkened, by the lit level.
+        near: (65536,) float32, how far a darkened frame may be from the group that it belongs to,
+            by the lit level.
+        reach: (65536,) int16, how far a frame may be from a level, by that.
+    """
+
+    low: Int16
+    high: Int16
+    dark: Int16
+    near: Float32
+    reach: Int16
+
+
+def _thresholds(noise: NoiseModel) -> _Thresholds:
     levels = np.arange(1 << 16, dtype=np.uint16).view(np.int16)
     unsampled = levels == _LOWEST_KEY
     values = np.maximum(np.nan_to_num(from_keys(levels).astype(np.float32), posinf=65504), 0)
@@ -337,7 +408,12 @@ def _thresholds(noise: NoiseModel) -> tuple[Int16, Int16, Int16, Float32]:
     dark[unsampled] = _LOWEST_KEY
     # The noise of a shadow is that of a fraction of the light; which one hardly matters.
     shaded = np.maximum(values * np.float32(_SHADE), np.float32(1e-4))
-    return low, high, dark, _GROUP * sigma_at(shaded)
+    near = np.asarray(_GROUP * sigma_at(shaded), np.float32)
+    return _Thresholds(low, high, dark, near, _to_int16(_GROUP * sigma))
+
+
+def _looked_up(table: NDArray[Value], keys: Int16) -> NDArray[Value]:
+    return np.asarray(cv2.LUT(np.ascontiguousarray(keys).view(np.uint16), table), table.dtype)
 
 
 class _KeySigma:

@@ -27,9 +27,10 @@ from shadowtool.core.plates import ExtremePlates, Plates
 from shadowtool.core.robust_plates import (
     SAMPLES,
     Keyed,
-    LitLevels,
+    Levels,
     Measured,
     RobustPlates,
+    SampledLevels,
     hide,
     keyed,
 )
@@ -351,7 +352,7 @@ class _Samples:
     """What a first reading of some of the frames tells: noise, background and lit levels."""
 
     noise: NoiseModel
-    levels: NDArray[np.int16]
+    levels: Levels
     count: int
 
 
@@ -391,7 +392,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         take.background = find_background(level, noise)
     if take.background is not None:
         make_folder(take.folder)
-    levels = LitLevels(height, width)
+    levels = SampledLevels(height, width)
     if with_levels:
         # The others, that were kept or whose exposure is off, are keyed now that all is known.
         ready = [frame for frame in grays if gains[frame] == 1]

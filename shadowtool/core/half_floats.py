@@ -13,8 +13,8 @@ Float16 = NDArray[np.float16]
 
 _INFINITE = 0x7C00
 _NOTHING = np.zeros(1)
-# Half of the unit that a single float's mantissa is rounded to, to keep 14 of its 23 bits.
-_HALF_UNIT = np.uint32(1 << 8)
+# Half of the unit that a single float's mantissa is rounded to, to keep 12 of its 23 bits.
+_HALF_UNIT = np.uint32(1 << 10)
 
 
 def to_float(values: NDArray[np.floating]) -> Float32:
@@ -41,9 +41,9 @@ def rounded(values: NDArray[np.floating]) -> Float16:
 
 
 def shortened(values: Float32) -> Float32:
-    """Single floats of any shape with 14 bits of their mantissa, rounded; NaN stays.
+    """Single floats of any shape with 12 bits of their mantissa, rounded; NaN stays.
 
-    A sixteenth of what a half can tell apart. The rest of a mean of noisy frames is noise, and
+    A quarter of what a half can tell apart. The rest of a mean of noisy frames is noise, and
     takes long to compress.
     """
     bits = values.view(np.uint32) + _HALF_UNIT

@@ -77,7 +77,7 @@ def mean_of_keys(total: NDArray[np.number], count: NDArray[np.number]) -> Float3
         count: of how many each is; NaN comes of none.
     """
     none = count == 0
-    mean = np.divide(total, np.maximum(count, 1), dtype=np.float64).astype(np.float32)
+    mean = np.divide(total, np.maximum(count, 1), dtype=np.float32)
     low = np.floor(mean)
     mean -= low
     keys = low.astype(np.int16)

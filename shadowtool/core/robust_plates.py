@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import in_all_channels
 from shadowtool.core.half_keys import (
     finite_keys,
     from_keys,
@@ -335,27 +336,30 @@ class RobustPlates:
     def measured(self) -> Measured:
         """The plates so far."""
         shape = self._count.shape
-        lit = np.empty((*shape, 3), np.float32)
-        shadow = np.full((*shape, 3), np.nan, np.float32)
+        lit, shadow = np.empty((*shape, 3), np.float32), np.full((*shape, 3), np.nan, np.float32)
         lit_frames, shadow_frames = self._count.astype(np.uint32), np.zeros(shape, np.uint32)
         for start in range(0, shape[0], _ROWS):
             rows = slice(start, start + _ROWS)
-            lit[rows] = mean_of_keys(self._total[rows], self._count[rows][..., None])
-            shaded = (self._lowest.frames[rows] > 0) | (self._next.frames[rows] > 0)
-            where = start * shape[1] + np.flatnonzero(shaded)
-            lowest, backup = self._lowest.at(where), self._next.at(where)
+            lit[rows] = _mean(self._total[rows], self._count[rows].astype(np.float32))
+            count, backup = self._lowest.frames[rows], self._next.frames[rows]
             # A group of one or two frames below a much larger one is a bird, not the shadow.
-            stray = (lowest.frames < _LEAST_GROUP) & (backup.frames >= 2 * lowest.frames)
-            count = np.where(stray, backup.frames, lowest.frames)
-            total = np.where(stray[:, None], backup.total, lowest.total)
-            shadow.reshape(-1, 3)[where] = mean_of_keys(total, count[:, None])
-            shadow_frames.ravel()[where] = count
+            stray = (count < _LEAST_GROUP) & (backup >= 2 * count)
+            count = np.where(stray, backup, count)
+            if count.any():
+                total = self._lowest.total[rows].copy()
+                cv2.copyTo(self._next.total[rows], stray.view(np.uint8), total)
+                shadow[rows], shadow_frames[rows] = _mean(total, count), count
         # Never at its lit level: what it was all the time is all that is known of it.
         never = (lit_frames == 0) & (shadow_frames > 0)
         if never.any():
             lit[never] = shadow[never]
             lit_frames[never] = shadow_frames[never]
         return Measured(lit, shadow, lit_frames, shadow_frames)
+
+
+def _mean(total: Float32, count: Float32) -> Float32:
+    """Values, (H, W, 3), of sums of so many keys, (H, W); NaN of none."""
+    return mean_of_keys(total, in_all_channels(count))
 
 
 def _below(gray: Int16) -> Float32:

@@ -28,7 +28,6 @@ from shadowtool.core.robust_plates import (
     SAMPLES,
     Keyed,
     Levels,
-    Measured,
     RobustPlates,
     SampledLevels,
     hide,
@@ -227,6 +226,7 @@ class _Take:
         reference: what exposure is measured against, on its grid; None until it is known.
         kept: sampled frames that need not be read again.
         known_gains: of the sampled frames.
+        masks: their automatic holdouts on the grid, once they are known.
         gains: of the frames that were used, where they are not 1.
         folder: where the automatic one is written.
     """
@@ -241,6 +241,7 @@ class _Take:
     reference: NDArray[np.float32] | None = None
     kept: dict[Frame, _Kept] = field(default_factory=dict)
     known_gains: dict[Frame, float] = field(default_factory=dict)
+    masks: dict[Frame, Bool] = field(default_factory=dict)
     gains: dict[str, float] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
@@ -298,7 +299,7 @@ class _Take:
                     marks.append(matte.fingerprint)
                     holdout = matte.plane("A", "Y", "R")
                 elif self.background is not None:
-                    holdout = self.automatic(grid)
+                    holdout = self.automatic(frame, grid, last)
                     if last:
                         write_png(_place(self.folder, frame), holdout, self.provenance)
             except InputError:
@@ -316,10 +317,14 @@ class _Take:
 
         yield from ordered_map(read, frames, self.run.jobs)
 
-    def automatic(self, grid: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def automatic(self, frame: Frame, grid: NDArray[np.float32], last: bool) -> NDArray[np.uint8]:
         """The automatic holdout, (H, W) uint8, of a frame's pixels on the grid."""
         assert self.background is not None
-        mask = figure_mask(grid, self.background)
+        mask = self.masks.pop(frame, None)
+        if mask is None:
+            mask = figure_mask(grid, self.background)
+        if not last:
+            self.masks[frame] = mask
         return full_size(mask, *self.footage.header.size, self.step)
 
     def all_shown(
@@ -347,13 +352,12 @@ class _Take:
         return image
 
 
-@dataclass
-class _Samples:
+class _Samples(NamedTuple):
     """What a first reading of some of the frames tells: noise, background and lit levels."""
 
     noise: NoiseModel
     levels: Levels
-    count: int
+    read: int
 
 
 def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool) -> _Samples:
@@ -398,7 +402,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         ready = [frame for frame in grays if gains[frame] == 1]
         for frame in ready:
             if take.background is not None:
-                hide(grays[frame], take.automatic(grids[frame]) > 0)
+                hide(grays[frame], take.automatic(frame, grids[frame], last=False) > 0)
             levels.add(grays.pop(frame))
         others = [frame for frame in grids if frame not in ready]
         for item in take.shown(others, with_keys=True, last=False):
@@ -421,7 +425,7 @@ def _spread(frames: int) -> list[int]:
 
 def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
     """Eq. (4), in one reading of all the frames; only a figure to find takes another."""
-    begun = _sample(take, frames, automatic, with_levels=False).count if automatic else 0
+    begun = _sample(take, frames, automatic, with_levels=False).read if automatic else 0
     numbers = {position: number for number, position in sample_positions(len(frames)).items()}
     thinned: dict[int, NDArray[np.float32]] = {}
     extremes = ExtremePlates()
@@ -435,9 +439,15 @@ def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
 
 def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | None) -> _Estimate:
     """Means of lit and shaded frames, and the plane's ratio where the shadow fell in part."""
-    sampled = _sample(take, frames, automatic, with_levels=True)
-    noise = sampled.noise
-    found = _measured(take, frames, sampled)
+    noise, levels, begun = _sample(take, frames, automatic, with_levels=True)
+    estimate = RobustPlates(levels, noise)
+    # What has been looked up in them is larger than they are.
+    del levels
+    for _, item in take.all_shown(frames, with_keys=True, begun=begun):
+        assert item.keys is not None
+        estimate.add(item.keys)
+    found = estimate.measured()
+    del estimate
     lit = shortened(found.lit)
 
     def complete() -> tuple[Plates, Figures]:
@@ -455,15 +465,6 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         return plates, figures
 
     return _Estimate(lit, noise, complete)
-
-
-def _measured(take: _Take, frames: list[Frame], sampled: _Samples) -> Measured:
-    """The second reading, of all the frames."""
-    estimate = RobustPlates(sampled.levels, sampled.noise)
-    for _, item in take.all_shown(frames, with_keys=True, begun=sampled.count):
-        assert item.keys is not None
-        estimate.add(item.keys)
-    return estimate.measured()
 
 
 def _place(folder: Path, frame: Frame) -> Path:

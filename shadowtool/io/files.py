@@ -10,7 +10,7 @@ import threading
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ _HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
 _SAMPLE, _SAMPLES = 1 << 16, 256
 # A prime number of words: no row of pixels, and no page, is a multiple of it.
 _FOLD = 4099
-# Bytes that are read at a time.
+# Bytes that are read at a time, a multiple of the fold's.
 _BLOCK = 8 * 8 * _FOLD
 _counter = itertools.count()
 
@@ -94,98 +94,39 @@ def _reading(path: Path) -> Iterator[None]:
         raise translated(error, path, "read") from None
 
 
-class Stream:
-    """A file that passes through memory once, to be decoded and fingerprinted on the way.
-
-    Reads go forward block by block; what lies behind the block is read once more.
-    """
-
-    def __init__(self, file: io.FileIO) -> None:
-        self._file = file
-        self._size = os.fstat(file.fileno()).st_size
-        self._block = memoryview(bytearray(_BLOCK))
-        self._start = self._length = self._place = 0
-        self._ended = False
-        self._checksum = _Checksum()
-        self.fault: OSError | None = None
-
-    def read(self, size: int) -> bytes:
-        """At most so many bytes; ``fault`` keeps an error, as OpenEXR passes it on as another."""
-        parts = []
-        try:
-            while size > 0:
-                offset = self._place - self._start
-                if offset < 0:
-                    part = os.pread(self._file.fileno(), min(size, -offset), self._place)
-                elif offset < self._length:
-                    part = bytes(self._block[offset : min(offset + size, self._length)])
-                elif not self._ended:
-                    self._advance()
-                    continue
-                else:
-                    break
-                if not part:
-                    break
-                parts.append(part)
-                self._place += len(part)
-                size -= len(part)
-        except OSError as error:
-            self.fault = error
-            raise
-        return parts[0] if len(parts) == 1 else b"".join(parts)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._place = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._place}.get(whence, self._size)
-        return self._place
-
-    def tell(self) -> int:
-        return self._place
-
-    def fingerprint(self) -> str:
-        """The `fingerprint` of all of it; reads what has not been yet."""
-        while not self._ended:
-            self._advance()
-        return self._checksum.result()
-
-    def _advance(self) -> None:
-        self._start += self._length
-        self._length = 0
-        while self._length < _BLOCK:
-            count = self._file.readinto(self._block[self._length :])
-            if not count:
-                self._ended = True
-                break
-            self._length += count
-        self._checksum.add(self._block[: self._length])
-
-
-class HeldStream(io.BytesIO):
-    """What `reading_once` holds, to be read like a `Stream`."""
-
-    def __init__(self, content: Content) -> None:
-        super().__init__(content.data)
-        self._fingerprint = content.fingerprint
-
-    def fingerprint(self) -> str:
-        return self._fingerprint
-
-
 @contextlib.contextmanager
-def open_stream(path: Path) -> Iterator[Stream | HeldStream]:
-    """Open a file for decoding. Raises as `read_bytes`, also for what OpenEXR has met in it."""
-    if path in _held.contents:
-        yield HeldStream(_held.contents[path])
+def unchanging(path: Path) -> Iterator[tuple[str | BinaryIO, str]]:
+    """A file for a library to decode, and its `fingerprint`.
+
+    The library gets the file's name: by itself it reads fastest. It gets the content where that is
+    held already, or where the name is in no encoding.
+
+    Raises:
+        InputError, RetryError: as `read_bytes`; RetryError also if the file changed meanwhile.
+    """
+    name = os.fspath(path)
+    if path in _held.contents or not _is_text(name):
+        content = read_content(path)
+        yield io.BytesIO(content.data), content.fingerprint
         return
+    before = _version(path)
+    yield name, fingerprint_file(path)
+    if _version(path) != before:
+        raise RetryError(f"{path}: changed while it was read; run again when it is whole")
+
+
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _version(path: Path) -> tuple[int, ...]:
     with _reading(path):
-        file = io.FileIO(path)
-    with file:
-        stream = Stream(file)
-        try:
-            with _reading(path):
-                yield stream
-        finally:
-            if stream.fault is not None:
-                raise translated(stream.fault, path, "read") from None
+        status = path.stat()
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
@@ -302,8 +243,16 @@ class _Checksum:
 
 def fingerprint_file(path: Path) -> str:
     """The `fingerprint` of a file's content. Raises as `read_bytes`."""
-    with open_stream(path) as stream:
-        return stream.fingerprint()
+    checksum = _Checksum()
+    block = memoryview(bytearray(_BLOCK))
+    with _reading(path), io.FileIO(path) as file:
+        length = _BLOCK
+        while length == _BLOCK:
+            length = 0
+            while count := file.readinto(block[length:]):
+                length += count
+            checksum.add(block[:length])
+    return checksum.result()
 
 
 def fingerprint_movie(path: Path) -> str:

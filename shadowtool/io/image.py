@@ -29,10 +29,8 @@ from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import DamagedFileError, InputError, ShadowtoolError
 from shadowtool.io.files import (
     Content,
-    HeldStream,
-    Stream,
-    open_stream,
     read_content,
+    unchanging,
     write_bytes,
 )
 
@@ -255,8 +253,8 @@ def read_image(path: Path) -> Image:
     """
     if path.suffix.lower() == PNG:
         return _decode_png(path, read_content(path))
-    with open_stream(path) as stream:
-        return _decode_exr(path, stream)
+    with unchanging(path) as (source, fingerprint):
+        return _decode_exr(path, source, fingerprint)
 
 
 def write_exr(
@@ -376,9 +374,11 @@ def to_code(linear: NDArray[np.floating], transfer: str = "srgb") -> NDArray[np.
 
 
 def _open_exr(
-    path: Path, source: BinaryIO | Stream, header_only: bool = False, separate: bool = False
+    path: Path, source: str | BinaryIO, header_only: bool = False, separate: bool = False
 ) -> Any:
     try:
+        if not isinstance(source, str):
+            source.seek(0)
         return OpenEXR.File(source, separate_channels=separate, header_only=header_only)
     except _EXR_FAULTS as error:
         raise DamagedFileError(
@@ -431,18 +431,16 @@ def _window(path: Path, raw: Mapping[str, Any], name: str) -> tuple[Corner, Corn
     return (first[0], first[1]), (last[0], last[1])
 
 
-def _decode_exr(path: Path, stream: Stream | HeldStream) -> Image:
+def _decode_exr(path: Path, source: str | BinaryIO, fingerprint: str) -> Image:
     # The header first: a picture that is refused must not be decoded, and a damaged part of a
     # multi-part file vanishes without a word when the pixels are read.
-    listed = _open_exr(path, stream, header_only=True)
+    listed = _open_exr(path, source, header_only=True)
     header = _exr_header(path, listed)
-    stream.seek(0)
     try:
-        file = _open_exr(path, stream)
+        file = _open_exr(path, source)
     except DamagedFileError:
         # OpenEXR joins R, G, B to one array only where they are of one type.
-        stream.seek(0)
-        file = _open_exr(path, stream, separate=True)
+        file = _open_exr(path, source, separate=True)
     if len(file.parts) != len(listed.parts):
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
     if len(file.parts) > 1:
@@ -461,7 +459,7 @@ def _decode_exr(path: Path, stream: Stream | HeldStream) -> Image:
         names = [name for name in "RGBA" if name in layers]
         colour = np.stack([layers.pop(name).astype(np.float32) for name in names], axis=-1)
         layers["".join(names)] = colour
-    return Image(path, header, layers, stream.fingerprint())
+    return Image(path, header, layers, fingerprint)
 
 
 def _placed(values: NDArray[Any], first: tuple[int, int], header: Header) -> NDArray[Any]:

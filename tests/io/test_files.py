@@ -19,10 +19,10 @@ from shadowtool.io.files import (
     fingerprint,
     fingerprint_file,
     make_folder,
-    open_stream,
     read_bytes,
     read_content,
     reading_once,
+    unchanging,
     write_bytes,
 )
 
@@ -286,35 +286,58 @@ BLOCK = 262_336
 
 
 @pytest.mark.parametrize("size", [0, 1, 5_000, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK, 700_001])
-def test_a_stream_reads_what_a_file_holds_wherever_it_is_asked(size, tmp_path):
+def test_a_large_files_fingerprint_is_its_contents_too(size, tmp_path):
     rng = np.random.default_rng(size)
     content = rng.integers(0, 256, size, np.uint8).tobytes()
     (tmp_path / "a").write_bytes(content)
-    with open_stream(tmp_path / "a") as stream:
-        assert stream.seek(0, os.SEEK_END) == size
-        place = stream.seek(0)
-        for number in range(60):
-            if number % 7 == 0:
-                place = stream.seek(int(rng.integers(0, size + 1)))
-            wanted = int(rng.choice([0, 1, 8, 5_000, 120_000, 400_000]))
-            assert stream.read(wanted) == content[place : place + wanted]
-            place = min(place + wanted, size)
-            assert stream.tell() == place
-        assert stream.fingerprint() == fingerprint(content)
-    with open_stream(tmp_path / "a") as unread:
-        assert unread.fingerprint() == fingerprint(content)
+    assert fingerprint_file(tmp_path / "a") == fingerprint(content)
 
 
-def test_what_is_held_is_streamed_from_memory(tmp_path):
+def test_a_file_is_decoded_by_its_name(tmp_path):
+    path = tmp_path / "a file"
+    path.write_bytes(b"first")
+    with unchanging(path) as (source, mark):
+        assert (source, mark) == (str(path), fingerprint(b"first"))
+
+
+@pytest.mark.parametrize("replaced", [True, False])
+def test_a_file_that_changes_while_it_is_decoded_is_worth_a_retry(replaced, tmp_path):
+    path, other = tmp_path / "a", tmp_path / "b"
+    path.write_bytes(b"first")
+    other.write_bytes(b"other")
+    times = path.stat().st_atime_ns, path.stat().st_mtime_ns
+    with pytest.raises(RetryError, match="a: changed while it was read"), unchanging(path):
+        if replaced:
+            os.utime(other, ns=times)
+            other.replace(path)
+        else:
+            path.write_bytes(b"more than that")
+
+
+def test_a_file_that_goes_while_it_is_decoded_is_named(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"first")
+    with pytest.raises(InputError, match="a: no such file"), unchanging(path):
+        path.unlink()
+
+
+def test_what_is_held_is_decoded_from_memory(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"first")
     with reading_once([path]):
         path.write_bytes(b"second")
-        with open_stream(path) as stream:
-            assert (stream.read(9), stream.fingerprint()) == (b"first", fingerprint(b"first"))
+        with unchanging(path) as (source, mark):
+            assert (source.read(9), mark) == (b"first", fingerprint(b"first"))
 
 
-def test_a_fault_of_the_machine_in_the_middle_of_a_stream_is_worth_a_retry(tmp_path, monkeypatch):
+def test_a_name_in_no_encoding_is_decoded_from_memory(tmp_path):
+    path = tmp_path / os.fsdecode(b"\xff.exr")
+    path.write_bytes(b"first")
+    with unchanging(path) as (source, mark):
+        assert (source.read(9), mark) == (b"first", fingerprint(b"first"))
+
+
+def test_a_fault_of_the_machine_while_reading_is_worth_a_retry(tmp_path, monkeypatch):
     path = tmp_path / "a"
     path.write_bytes(bytes(10))
 
@@ -325,12 +348,8 @@ def test_a_fault_of_the_machine_in_the_middle_of_a_stream_is_worth_a_retry(tmp_p
     monkeypatch.setattr("io.FileIO", Failing)
     with pytest.raises(RetryError, match="a: cannot read"):
         fingerprint_file(path)
-    # OpenEXR passes the error on as another.
-    with pytest.raises(RetryError, match="a: cannot read"), open_stream(path) as stream:
-        try:
-            stream.read(5)
-        except OSError:
-            raise ValueError("something") from None
+    with pytest.raises(RetryError, match="a: cannot read"), unchanging(path):
+        pass
 
 
 def test_the_fingerprint_of_a_missing_file_is_an_error(tmp_path):

@@ -38,39 +38,84 @@ class Content(NamedTuple):
     fingerprint: str
 
 
-class _Held(threading.local):
-    """What `reading_once` holds for the thread."""
+class _Version(NamedTuple):
+    """What tells a file from another under its name, without reading it."""
+
+    device: int
+    number: int
+    size: int
+    changed: int
+
+
+class _Known(threading.local):
+    """What `fingerprinted` holds for the thread."""
 
     def __init__(self) -> None:
-        self.contents: dict[Path, Content] = {}
+        self.files: dict[Path, tuple[_Version, str]] = {}
 
 
-_held = _Held()
+_known = _Known()
 
 
 @contextlib.contextmanager
-def reading_once(paths: Sequence[Path]) -> Iterator[list[str]]:
-    """Read files and give their fingerprints; until it ends, this thread reads them from memory.
+def fingerprinted(paths: Sequence[Path]) -> Iterator[list[str]]:
+    """Give files' fingerprints; until it ends, this thread reads what they stand for.
 
-    So what is worked on is what the fingerprint says, even if the file changes meanwhile.
+    If a file changes meanwhile, reading it is an error.
 
     Raises:
         InputError, RetryError: as `read_bytes`.
     """
-    contents = {path: read_content(path) for path in paths}
-    before, _held.contents = _held.contents, contents
+    known = {path: (_version(path), fingerprint_file(path)) for path in paths}
+    before, _known.files = _known.files, known
     try:
-        yield [contents[path].fingerprint for path in paths]
+        yield [known[path][1] for path in paths]
     finally:
-        _held.contents = before
+        _known.files = before
+
+
+@contextlib.contextmanager
+def unchanging(path: Path) -> Iterator[tuple[str | BinaryIO, str]]:
+    """A file for a library to decode, and its `fingerprint`.
+
+    The library gets the file's name: by itself it reads fastest. It gets the content where the
+    name is in no encoding.
+
+    Raises:
+        InputError, RetryError: as `read_bytes`; RetryError also if the file changed meanwhile.
+    """
+    version, mark = _known.files.get(path) or (_version(path), fingerprint_file(path))
+    name = os.fspath(path)
+    yield name if _is_text(name) else io.BytesIO(read_bytes(path)), mark
+    if _version(path) != version:
+        raise _changed(path)
 
 
 def read_content(path: Path) -> Content:
-    """The file's content with its fingerprint. Raises as `read_bytes`."""
-    if path in _held.contents:
-        return _held.contents[path]
+    """The file's content with its fingerprint. Raises as `unchanging`."""
     data = read_bytes(path)
-    return Content(data, fingerprint(data))
+    mark = fingerprint(data)
+    if path in _known.files and _known.files[path][1] != mark:
+        raise _changed(path)
+    return Content(data, mark)
+
+
+def _version(path: Path) -> _Version:
+    with _reading(path):
+        status = path.stat()
+    return _Version(status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
+
+
+def _changed(path: Path) -> RetryError:
+    return RetryError(f"{path}: changed while it was read; run again when it is whole")
+
+
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def read_bytes(path: Path) -> bytes:
@@ -92,41 +137,6 @@ def _reading(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: no such file") from None
     except OSError as error:
         raise translated(error, path, "read") from None
-
-
-@contextlib.contextmanager
-def unchanging(path: Path) -> Iterator[tuple[str | BinaryIO, str]]:
-    """A file for a library to decode, and its `fingerprint`.
-
-    The library gets the file's name: by itself it reads fastest. It gets the content where that is
-    held already, or where the name is in no encoding.
-
-    Raises:
-        InputError, RetryError: as `read_bytes`; RetryError also if the file changed meanwhile.
-    """
-    name = os.fspath(path)
-    if path in _held.contents or not _is_text(name):
-        content = read_content(path)
-        yield io.BytesIO(content.data), content.fingerprint
-        return
-    before = _version(path)
-    yield name, fingerprint_file(path)
-    if _version(path) != before:
-        raise RetryError(f"{path}: changed while it was read; run again when it is whole")
-
-
-def _is_text(name: str) -> bool:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def _version(path: Path) -> tuple[int, ...]:
-    with _reading(path):
-        status = path.stat()
-    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:

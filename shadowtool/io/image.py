@@ -94,6 +94,11 @@ class Image:
     layers: Mapping[str, NDArray[Any]]
     fingerprint: str
 
+    @property
+    def stored(self) -> int:
+        """How many bytes its file takes."""
+        return int(self.fingerprint.partition(":")[0])
+
     def rgb(self, transfer: str = "auto") -> NDArray[np.floating]:
         """(H, W, 3) linear light; float16 where the file has halfs and needs no decoding.
 

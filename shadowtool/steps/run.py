@@ -12,7 +12,7 @@ from typing import Any
 from shadowtool import __version__
 from shadowtool.choices import Missing
 from shadowtool.errors import DamagedFileError, InputError, OutputExistsError
-from shadowtool.io.files import is_file, new_folders, reading_once
+from shadowtool.io.files import fingerprinted, is_file, new_folders
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame
@@ -184,7 +184,7 @@ class FrameWork:
 
     def _frame(self, frame: Frame, run: Run) -> tuple[Figures, bool] | None:
         try:
-            with reading_once(self.sources(frame)) as inputs:
+            with fingerprinted(self.sources(frame)) as inputs:
                 mark = self.recipe.fingerprint([*self.shared, *inputs])
                 if run.resume and (figures := current(self.products(frame), mark)) is not None:
                     return {"fingerprint": mark, **figures}, True

@@ -22,7 +22,7 @@ from shadowtool.core.warp_map import (
     sample,
 )
 from shadowtool.errors import OptionError, ReshootError
-from shadowtool.io.files import is_file, make_folder, read_content
+from shadowtool.io.files import is_file, make_folder
 from shadowtool.io.image import EXR, Header, Image, read_header, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, WARP, read_scan, read_warp, write_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
@@ -262,8 +262,7 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
 
 def _has_grain(image: Image) -> bool:
     """Whether a picture's own file could hardly make it smaller."""
-    stored = len(read_content(image.path).data)
-    return stored > _GRAIN * sum(values.nbytes for values in image.layers.values())
+    return image.stored > _GRAIN * sum(values.nbytes for values in image.layers.values())
 
 
 def _warped(image: np.ndarray, places: np.ndarray, edge: float, single: bool) -> np.ndarray:

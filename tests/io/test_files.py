@@ -18,10 +18,10 @@ from shadowtool.errors import InputError, RetryError, ShadowtoolError
 from shadowtool.io.files import (
     fingerprint,
     fingerprint_file,
+    fingerprinted,
     make_folder,
     read_bytes,
     read_content,
-    reading_once,
     unchanging,
     write_bytes,
 )
@@ -321,13 +321,21 @@ def test_a_file_that_goes_while_it_is_decoded_is_named(tmp_path):
         path.unlink()
 
 
-def test_what_is_held_is_decoded_from_memory(tmp_path):
-    path = tmp_path / "a"
+def test_a_file_that_changed_since_its_fingerprint_was_given_is_an_error(tmp_path):
+    path, other = tmp_path / "a", tmp_path / "b"
     path.write_bytes(b"first")
-    with reading_once([path]):
+    other.write_bytes(b"other")
+    with fingerprinted([path, other, path]) as marks:
+        assert marks == [fingerprint(b"first"), fingerprint(b"other"), fingerprint(b"first")]
+        with unchanging(other) as (source, mark):
+            assert (source, mark) == (str(other), marks[1])
         path.write_bytes(b"second")
-        with unchanging(path) as (source, mark):
-            assert (source.read(9), mark) == (b"first", fingerprint(b"first"))
+        with pytest.raises(RetryError, match="a: changed while it was read"), unchanging(path):
+            pass
+        with pytest.raises(RetryError, match="a: changed while it was read"):
+            read_content(path)
+        assert read_content(other) == (b"other", marks[1])
+    assert read_content(path) == (b"second", fingerprint(b"second"))
 
 
 def test_a_name_in_no_encoding_is_decoded_from_memory(tmp_path):
@@ -357,24 +365,11 @@ def test_the_fingerprint_of_a_missing_file_is_an_error(tmp_path):
         fingerprint_file(tmp_path / "a")
 
 
-def test_what_is_held_is_what_the_fingerprint_says_though_the_file_changes(tmp_path):
-    one, other = tmp_path / "a", tmp_path / "b"
-    one.write_bytes(b"first")
-    other.write_bytes(b"other")
-    with reading_once([one, other, one]) as marks:
-        one.write_bytes(b"second")
-        other.unlink()
-        assert marks == [fingerprint(b"first"), fingerprint(b"other"), fingerprint(b"first")]
-        assert read_content(one) == (b"first", fingerprint(b"first"))
-        assert read_content(other).data == b"other"
-    assert read_content(one) == (b"second", fingerprint(b"second"))
-
-
-def test_what_is_held_is_held_for_its_own_thread(tmp_path):
+def test_a_fingerprint_is_known_to_its_own_thread_alone(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"first")
     seen = []
-    with reading_once([path]):
+    with fingerprinted([path]):
         path.write_bytes(b"second")
         thread = threading.Thread(target=lambda: seen.append(read_content(path).data))
         thread.start()
@@ -382,10 +377,10 @@ def test_what_is_held_is_held_for_its_own_thread(tmp_path):
     assert seen == [b"second"]
 
 
-def test_nothing_is_held_after_a_failure(tmp_path):
+def test_nothing_is_known_after_a_failure(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"first")
-    with pytest.raises(InputError, match="nowhere"), reading_once([path, tmp_path / "nowhere"]):
+    with pytest.raises(InputError, match="nowhere"), fingerprinted([path, tmp_path / "nowhere"]):
         pass
     path.write_bytes(b"second")
     assert read_content(path).data == b"second"

@@ -1,6 +1,7 @@
-"""Signals reach the command, whatever Python is doing; its sums don't depend on the machine."""
+"""Signals reach the command whatever Python is doing; memory and threads are used as agreed."""
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -68,6 +69,25 @@ def test_other_things_that_cannot_be_raised_are_still_shown(capsys):
     del thing
     assert reference() is None
     assert "ZeroDivisionError" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is for GNU's C library alone")
+def test_memory_that_was_freed_is_used_again_without_the_system():
+    script = """
+import resource
+import numpy as np
+import shadowtool.cli.process as process
+def faults(arguments):
+    def touch():
+        pieces = [np.ones(2_000_000) for _ in range(8)]
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    before, after = touch(), touch()
+    print(after - before < 50)
+process.run_command = faults
+process.run_process()
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True)
+    assert done.stdout == b"True\n"
 
 
 def test_linear_algebra_runs_on_one_thread_whatever_the_machine_has():

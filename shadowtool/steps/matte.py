@@ -283,7 +283,9 @@ class _Take:
             "not_finite": 0 if shown.bad is None else int(np.count_nonzero(shown.bad)),
             "gain": round(shown.gain, 6),
         }
-        marked = with_figures(provenance, figures)
+        marked, header = with_figures(provenance, figures), shown.header
+        # The encoder wants the room.
+        del shown
         products: tuple[tuple[Only, Callable[[], dict[str, NDArray[np.float16]]]], ...] = (
             ("alpha", lambda: _figure_layers(figure)),
             ("beta", lambda: self._beta_layers(beta, hidden, unknown, figure)),
@@ -291,7 +293,7 @@ class _Take:
         # One after the other, so that no two are held at once.
         for product, layers in products:
             if product in self.wanted:
-                write_exr(self._file(product, frame), layers(), shown.header, marked)
+                write_exr(self._file(product, frame), layers(), header, marked)
         return figures
 
     def summary(self, rows: list[Figures]) -> Figures:

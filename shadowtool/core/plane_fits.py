@@ -27,6 +27,9 @@ RADII, _STEP, _WIDEST = (1, 2, 4, 7), 12.0, 40
 # Mean squared deviation from its plane, in squared errors, above which a window holds more than
 # one surface.
 _MISFIT = 1.5
+# On a plane three quarters of the windows are to deviate by no more than this; windows of so many
+# pixels together tell.
+_USUAL_MISFIT, _TOLD = 1.2, 200_000
 # A pixel's own measurement may deviate from the plane, and the plane from that of smaller windows,
 # by this many standard deviations.
 _AGREES = 3.0
@@ -91,9 +94,7 @@ def fit_planes(
     """
     known = np.isfinite(value) & np.isfinite(error)
     variance = np.where(known, error, 1).astype(np.float64) ** 2
-    trusted = known & _in_company(
-        np.where(known, value, np.float32(np.nan)), variance, windows.near
-    )
+    trusted = _trusted(value, error, windows.near)
     measured = np.where(known, value, 0).astype(np.float64)
     weight = np.where(trusted, 1 / np.maximum(variance, 1e-12), 0)
     first, last, _ = wanted.indices(len(value))
@@ -118,10 +119,50 @@ def fit_planes(
     return best, np.sqrt(spread, out=spread)
 
 
-def _in_company(value: Float32, variance: Float64, near: float) -> Bool:
+def _trusted(value: Float32, error: Float32, near: float) -> Bool:
+    """Which measurements are known, and agree with others around them."""
+    known = np.isfinite(value) & np.isfinite(error)
+    variance = np.where(known, error, 1).astype(np.float32) ** 2
+    return known & _in_company(np.where(known, value, np.float32(np.nan)), variance, near)
+
+
+def understated(value: Float32, error: Float32, plane: Bool, windows: Windows = Windows()) -> float:
+    """By what factor errors are larger than they were said to be, judged where a plane is known to
+    be; 1 if they are not.
+
+    A camera that trembles, or a codec, moves measurements by more than their noise explains. Where
+    errors are understated next to no window seems to hold a single surface.
+
+    Args:
+        value, error: (H, W) as of `fit_planes`.
+        plane: (H, W), where all belongs to one plane.
+    """
+    radius = max(windows.radii)
+    size = (2 * radius + 1, 2 * radius + 1)
+    inside = cv2.erode(
+        plane.astype(np.uint8), np.ones(size), borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    places = np.flatnonzero(inside)
+    every = max(1, len(places) * size[0] ** 2 // _TOLD)
+    middle = np.divmod(places[::every], value.shape[1])
+    y, x = (part.ravel() for part in np.mgrid[-radius : radius + 1, -radius : radius + 1])
+    around = middle[0][:, np.newaxis] + y, middle[1][:, np.newaxis] + x
+    used = _trusted(value, error, windows.near)[around]
+    weight = np.where(used, 1 / np.maximum(error[around].astype(np.float64) ** 2, 1e-12), 0)
+    measured = np.where(used, value[around], 0).astype(np.float64)
+    terms = np.stack([np.ones(len(x)), x / radius, y / radius], axis=-1)
+    normal = np.einsum("nk,ki,kj->nij", weight, terms, terms) + 1e-6 * np.eye(3)
+    right = np.einsum("nk,ki->ni", weight * measured, terms)
+    planes = np.linalg.solve(normal, right[..., np.newaxis])[..., 0]
+    count = used.sum(axis=1)
+    misfit = (weight * (measured - planes @ terms.T) ** 2).sum(axis=1) / np.maximum(count - 3, 1)
+    misfit = misfit[count > len(x) / 2]
+    return float(np.sqrt(max(np.quantile(misfit, 0.75) / _USUAL_MISFIT, 1))) if misfit.size else 1.0
+
+
+def _in_company(value: Float32, variance: Float32, near: float) -> Bool:
     """Where enough of the eight pixels around agree with a measurement; NaN agrees with none."""
     company = np.zeros(value.shape, np.uint8)
-    variance = variance.astype(np.float32)
     # The other four directions are these from the other pixel's point of view.
     for dy, dx in ((0, 1), (1, -1), (1, 0), (1, 1)):
         here, there = _overlap(value.shape, dy, dx)

@@ -14,6 +14,7 @@ from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
 from shadowtool.core.exposure import RunningGain, sampled_areas, without_gain
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.pictures import display, time_picture
+from shadowtool.core.plane_fits import understated
 from shadowtool.core.shadow_lines import (
     Bend,
     NoLinesError,
@@ -63,6 +64,8 @@ PICTURE = "scan.png"
 _BENT, _CERTAIN = 1.0, 6.0
 # A sweep reaches little of the frame, and is fast: a part of the frame, pixels a frame.
 _LITTLE, _FAST = 0.5, 20.0
+# Times differ by so many times what noise explains only if something is wrong.
+_TREMBLING = 2.0
 # If more of the frame than this can't be told from one reading, the frames are read again.
 _LOST = 0.05
 
@@ -115,7 +118,7 @@ def scan(
             "%s: frame numbers this large leave float32 times few digits; renumber the take",
             footage.sequence.pattern,
         )
-    times = _times(crossings, noise, region, numbers, run.jobs)
+    times, raised = _times(crossings, noise, region, numbers, run.jobs)
     points = zero_crossings(times.time, region, numbers)
     try:
         lines = fit_shadow_lines(points, numbers)
@@ -125,7 +128,7 @@ def scan(
             " or mark a larger plane"
         ) from None
     bend = line_bend(points, numbers, lines, footage.header.size)
-    figures = _figures(times, lines, gains, bend)
+    figures = _figures(times, lines, gains, bend) | {"errors_raised": round(raised, 2)}
     _advise(figures, footage.sequence.pattern)
     mark = recipe.fingerprint([plane_mark, *marks])
     provenance = recipe.provenance(mark)
@@ -236,8 +239,9 @@ def _times(
     region: NDArray[np.bool_],
     numbers: NDArray[np.float64],
     jobs: int | None,
-) -> ShadowTimes:
-    """Times and errors, each pixel's own and as its neighbours tell them too."""
+) -> tuple[ShadowTimes, float]:
+    """Times and errors, each pixel's own and as its neighbours tell them too; and by what factor
+    errors are larger than noise makes them."""
     own, own_error = own_times(crossings, noise)
     contrast = np.nan_to_num(crossings.highest - crossings.lowest)
     loss = usual_loss(contrast, crossings.highest, crossings.at > 0, region)
@@ -246,6 +250,8 @@ def _times(
     own_error /= np.maximum(loss, SHADE) ** 2
     time, error = np.empty_like(own), np.empty_like(own_error)
     windows = time_windows(own, region)
+    raised = understated(own, own_error, region, windows)
+    own_error *= np.float32(raised)
 
     def refine(band: tuple[slice, slice]) -> None:
         rows, inner = band
@@ -258,7 +264,8 @@ def _times(
         # From positions among the frames to frame numbers, which are not one apart.
         spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))
         error, own_error = ((e * spacing).astype(np.float32) for e in (error, own_error))
-    return ShadowTimes(_numbers(time, numbers), error, contrast, _numbers(own, numbers), own_error)
+    time, own = _numbers(time, numbers), _numbers(own, numbers)
+    return ShadowTimes(time, error, contrast, own, own_error), raised
 
 
 def _numbers(clock: Float32, numbers: NDArray[np.float64]) -> Float32:
@@ -283,6 +290,13 @@ def _advise(figures: Figures, take: str) -> None:
             "%s: the sweep reached only %.0f%% of the frame; what it misses needs two others",
             take,
             100 * reached,
+        )
+    if figures["errors_raised"] > _TREMBLING:
+        logger.warning(
+            "%s: times on the plane differ by %.1f times what noise explains; a camera that"
+            " trembles or a codec does that, fix it or stabilize the take",
+            take,
+            figures["errors_raised"],
         )
     if figures["pixels_per_frame"] > _FAST:
         logger.warning(

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowtool.core.plane_fits import RADII, Windows, fit_planes
+from shadowtool.core.plane_fits import RADII, Windows, fit_planes, understated
 
 REACH = Windows().reach
 ROWS, COLUMNS = np.mgrid[:60, :80].astype(np.float64)
@@ -217,3 +217,51 @@ def test_any_picture_gives_one_of_its_size(
     assert np.isnan(fitted[np.isnan(value)]).all()
     assert np.array_equal(np.isfinite(fitted), np.isfinite(spread))
     assert (spread > 0).all()
+
+
+PLANE = np.ones(ROWS.shape, bool)
+SLOPED = 3 + 0.1 * ROWS - 0.07 * COLUMNS
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_that_are_right_are_not_understated(seed: int) -> None:
+    assert understated(*measured(SLOPED, 0.05, seed), PLANE) == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize("larger", [2, 5])
+def test_it_is_told_by_how_much_errors_are_understated(larger: float) -> None:
+    value, error = measured(SLOPED, 0.05)
+    # A quarter of the windows may deviate a little more than all others.
+    assert understated(value, error / larger, PLANE) == pytest.approx(larger, rel=0.1)
+
+
+def test_errors_that_are_too_large_are_left() -> None:
+    value, error = measured(SLOPED, 0.05)
+    assert understated(value, 3 * error, PLANE) == 1
+
+
+def test_what_lies_off_the_plane_and_what_is_alone_says_nothing_of_errors() -> None:
+    value, error = measured(SLOPED, 0.05)
+    plane = COLUMNS < 50
+    expected = understated(value, error, plane)
+    value[:, 50:] = np.random.default_rng(0).uniform(0, 99, (60, 30))
+    value[5::9, 3::7], value[7::9, 5::7] = -20, np.nan
+    error[7::9, 5::7] = np.inf
+    before = value.copy()
+    assert understated(value, error, plane) == pytest.approx(expected, abs=0.1)
+    assert np.array_equal(value, before, equal_nan=True)
+
+
+def test_without_a_plane_or_anything_known_errors_are_believed() -> None:
+    value, error = measured(SLOPED, 0.05)
+    assert understated(value, error / 9, np.zeros_like(PLANE)) == 1
+    assert understated(value, error / 9, COLUMNS < 6) == 1
+    assert understated(np.full_like(value, np.nan), np.full_like(error, np.inf), PLANE) == 1
+
+
+def test_errors_that_are_understated_keep_no_plane_from_being_fitted() -> None:
+    value, error = measured(SLOPED, 0.05)
+    said = error / 4
+    raised = said * np.float32(understated(value, said, PLANE))
+    off, off_raised = (np.abs(fit_planes(value, e)[0] - SLOPED).mean() for e in (said, raised))
+    assert off_raised < 0.5 * off

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -204,3 +205,26 @@ def test_a_lens_that_bows_the_lines_is_reported(
     result = scan(folder, tmp_path / "scan", plane=everything)
     assert result.figures["bend"]["pixels"] == pytest.approx(-0.05 * SCENE.height / 2, rel=0.3)
     assert "as a lens bends them" in caplog.text
+
+
+def test_a_camera_that_trembles_is_told_by_times_that_differ_by_more_than_noise(
+    tmp_path: Path, mask: str
+) -> None:
+    sweep = SWEEPS["second"]
+    rng = np.random.default_rng(0)
+    raised = []
+    for tremble in (0.0, 0.5):
+        folder = tmp_path / f"{tremble}"
+        folder.mkdir()
+        for frame in range(SCENE.frames_of(sweep)):
+            image = SCENE.image(SCENE.sweep_beta(sweep, frame))
+            move = np.eye(2, 3, dtype=np.float32)
+            move[:, 2] = rng.normal(0, tremble, 2)
+            size = (SCENE.width, SCENE.height)
+            image = cv2.warpAffine(image, move, size, borderMode=cv2.BORDER_REPLICATE)
+            path = folder / f"take.{1001 + frame}.exr"
+            write_exr(path, {"RGB": to_half(SCENE.noisy(image, frame))}, Header(*size))
+        raised.append(scan(folder, tmp_path / "scan" / folder.name, plane=mask).figures)
+    steady, trembling = (figures["errors_raised"] for figures in raised)
+    assert steady < 1.1
+    assert trembling > 1.3 * steady

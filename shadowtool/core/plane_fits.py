@@ -131,11 +131,17 @@ def understated(value: Float32, error: Float32, plane: Bool, windows: Windows = 
     be; 1 if they are not.
 
     A camera that trembles, or a codec, moves measurements by more than their noise explains. Where
-    errors are understated next to no window seems to hold a single surface.
+    errors are understated next to no window seems to hold a single surface. With r the deviations
+    from a window's own plane and n their number, Σ(r/σ)² / (n - 3) would be 1; what three quarters
+    of the windows stay below tells by how much it is more.
 
     Args:
-        value, error: (H, W) as of `fit_planes`.
-        plane: (H, W), where all belongs to one plane.
+        value, error: (H, W) float32 as of `fit_planes`; NaN and infinite unknown, left out.
+        plane: (H, W) bool, where all belongs to one plane.
+        windows: the largest of them are looked at, as many as lie on the plane altogether.
+
+    Returns:
+        The factor, at least 1; 1 also if no window can tell.
     """
     radius = max(windows.radii)
     size = (2 * radius + 1, 2 * radius + 1)

@@ -100,7 +100,7 @@ def test_the_mean_is_off_by_a_tenth_of_the_range_that_straddles_a_power_of_two(
     middle = mantissa * 2.0**exponent
     spread = 0.03 * middle
     rng = np.random.default_rng(seed)
-    values = (middle + rng.uniform(-1, 1, (100, 50)) * spread).astype(np.float16)
+    values = (middle + rng.uniform(-1, 1, (1000, 50)) * spread).astype(np.float16)
     error = of_keys(values) - values.astype(np.float64).mean(axis=0)
     assert np.abs(error).max() < 0.1 * 2 * spread
 

@@ -64,12 +64,7 @@ class Backdrop:
     def variance(self, image: Float32) -> Float32:
         """Of what is seen of the background at these values, (..., 3): the noise's and the plates'
         own."""
-        return self.noise_variance(image) + self.own_variance(image)
-
-    def noise_variance(self, image: Float32) -> Float32:
-        """Of the noise at these values, (..., 3)."""
-        slope, floor = self.noise.slope, self.noise.floor
-        return np.asarray(np.maximum(image, 0) * np.float32(slope) + np.float32(floor), np.float32)
+        return self.noise.variance(image) + self.own_variance(image)
 
     def own_variance(self, image: Float32) -> Float32:
         """Of the plates at these values, (..., 3)."""

@@ -109,12 +109,10 @@ def shadow_contrast(plates: Plates, noise: NoiseModel) -> Float32:
         for rows in bands(contrast.shape):
             lit, shadow = plates.lit[rows], plates.shadow[rows]
             span = lit - shadow
-            sigma = noise.sigma((lit + shadow) / 2)
-            sigma *= span
-            sigma *= sigma
             span *= span
             length = _sum(span)
-            np.divide(length, np.sqrt(_sum(sigma)), out=contrast[rows])
+            span *= noise.variance((lit + shadow) / 2)
+            np.divide(length, np.sqrt(_sum(span)), out=contrast[rows])
             contrast[rows][length == 0] = 0
     return contrast
 

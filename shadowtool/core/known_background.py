@@ -191,7 +191,7 @@ class _Around(NamedTuple):
         darkest: (H, W), the least β that is not far; None if none but ``behind`` is thought of.
     """
 
-    near: Index
+    near: NDArray[np.int32]
     behind: Float32
     uneven: Float32
     darkest: Float32 | None
@@ -270,7 +270,7 @@ def _gather(
     grounds = [plates.under(beta) for beta in betas]
     return _Pixels(
         seen=_by_channel(sample),
-        noise=_by_channel(plates.noise_variance(sample)),
+        noise=_by_channel(backdrop.noise.variance(sample)),
         behind=_by_channel(*grounds)[..., which],
         shift=_by_channel(*shifts)[..., which],
         error=_by_channel(*(plates.own_variance(ground) for ground in grounds))[..., which],
@@ -287,14 +287,14 @@ def _by_channel(*values: Float32) -> Float32:
     return np.stack([value.T for value in values], axis=-1)
 
 
-def _nearest(solid: Bool) -> Index:
+def _nearest(solid: Bool) -> NDArray[np.int32]:
     """For each pixel the place of the mask's nearest, counted row by row."""
     _, labels = cv2.distanceTransformWithLabels(
         (~solid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    places = np.zeros(int(labels.max()) + 1, np.intp)
+    places = np.zeros(int(labels.max()) + 1, np.int32)
     places[labels[solid]] = np.flatnonzero(solid)
-    return np.asarray(places[labels], np.intp)
+    return np.asarray(places[labels], np.int32)
 
 
 def _unevenness(behind: Float32) -> Float32:

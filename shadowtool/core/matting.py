@@ -80,14 +80,13 @@ def pull_figure(
         The figure; empty if there is none, black where the frame is unknown.
     """
     height, width = frame_size or image.shape[:2]
-    alpha, foreground = np.zeros(image.shape[:2], np.float32), np.zeros(image.shape, np.float32)
     if drawn is None:
-        drawn = np.full(alpha.shape, UNKNOWN, np.uint8)
+        drawn = np.full(image.shape[:2], UNKNOWN, np.uint8)
     trimap = np.where(drawn == FIGURE, FIGURE, BACKGROUND)
     seen, unknown, bad = _without_unknown(image, backdrop, unknown)
     box = around(changed(seen, backdrop) | (trimap == FIGURE), MARGIN)
     if box is None:
-        return Figure(foreground, alpha, trimap)
+        return Figure(np.zeros_like(image), np.zeros(image.shape[:2], np.float32), trimap)
     reach = max(_REACH, round(_REACH_PART * width))
     part, ground = seen[box], backdrop.at(box)
     nearest = ground.nearest(part)
@@ -97,12 +96,15 @@ def pull_figure(
     wide = wide_trimap(found.mask, found.maybe, reach)
     wide = np.where(drawn[box] == UNKNOWN, wide, drawn[box])
     behind = ground_beta(nearest.beta, (wide == BACKGROUND) & ~unknown[box])
-    first = measure(part, wide, behind, ground, found.excess)
-    prior = edge_prior(*first, wide, found.mask, reach)
+    measured = measure(part, wide, behind, ground, found.excess)
+    prior = edge_prior(*measured, wide, found.mask, reach)
     narrow = narrowed(wide, prior, found.mask)
     prior = doubted(prior, nearest.distance2)
+    # Pictures of the figure's size are the most of what a frame takes.
+    del measured, nearest
     solved = solve(part, narrow, behind, ground, reach, prior, found.excess)
     whole = np.where(solved.alpha > 1 - _NOTHING, np.float32(1), solved.alpha)
+    alpha, foreground = np.zeros(image.shape[:2], np.float32), np.zeros_like(image)
     alpha[box] = np.where(whole < _NOTHING, np.float32(0), whole)
     np.multiply(alpha[box][..., np.newaxis], solved.foreground, out=foreground[box])
     foreground[bad] = 0

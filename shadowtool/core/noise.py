@@ -53,10 +53,15 @@ class NoiseModel:
         Returns:
             (..., 3) float32, above 0 wherever ``floor`` is.
         """
-        variance = np.maximum(image, 0, dtype=np.float32)
+        variance = self.variance(image)
+        return np.asarray(np.sqrt(variance, out=variance), np.float32)
+
+    def variance(self, image: NDArray[np.floating]) -> Float32:
+        """The square of `sigma`."""
+        variance: Float32 = np.maximum(image, 0, dtype=np.float32)
         variance *= self.slope.astype(np.float32)
         variance += self.floor.astype(np.float32)
-        return np.asarray(np.sqrt(variance, out=variance), np.float32)
+        return variance
 
 
 @dataclass(frozen=True)

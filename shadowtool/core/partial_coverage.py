@@ -150,7 +150,7 @@ def complete_shadow(
     for start in range(0, both.size, _BLOCK):
         where = both[start : start + _BLOCK]
         measured, ratios = (p.reshape(-1, 3).take(where, axis=0) for p in (result, expected))
-        precision = frames.reshape(-1, 1).take(where, axis=0) / noise.sigma(measured) ** 2
+        precision = frames.reshape(-1, 1).take(where, axis=0) / noise.variance(measured)
         prior = 1 / np.maximum(spread * ratios, 1e-6) ** 2
         mean = (precision * measured + prior * ratios) / (precision + prior)
         result.reshape(-1, 3)[where] = mean

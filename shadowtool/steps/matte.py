@@ -227,18 +227,23 @@ class _Figure(NamedTuple):
     """The figure in a frame.
 
     Attributes:
-        alpha: (H, W) float32 in [0, 1].
         trimap: (H, W) uint8, where one was made.
         box: what holds all of it.
+        alpha: of the box, (h, w) float32 in [0, 1].
         foreground: of the box, (h, w, 3) float32, premultiplied.
         ground: of the box, (h, w, 3) float32, what is seen past the figure.
     """
 
-    alpha: Float32
     trimap: UInt8 | None
     box: Box
+    alpha: Float32
     foreground: Float32
     ground: Float32
+
+    @classmethod
+    def none(cls, trimap: UInt8 | None) -> "_Figure":
+        nothing = np.zeros((0, 0, 3), np.float32)
+        return cls(trimap, _NONE, nothing[..., 0], nothing, nothing)
 
 
 @dataclass(frozen=True)
@@ -273,7 +278,8 @@ class _Take:
             write_png(self._file("trimap", frame), figure.trimap, provenance)
         if self.wanted == ("trimap",):
             return {}
-        hidden = figure.alpha >= HIDDEN
+        hidden = np.zeros(self.scene.unknown.shape, bool)
+        hidden[figure.box] = figure.alpha >= HIDDEN
         beta = self._beta(shown, figure, hidden)
         unknown = np.isnan(beta)
         unknown = np.asarray(unknown.any(axis=-1)) if beta.ndim == 3 else unknown
@@ -287,7 +293,7 @@ class _Take:
         # The encoder wants the room.
         del shown
         products: tuple[tuple[Only, Callable[[], dict[str, NDArray[np.float16]]]], ...] = (
-            ("alpha", lambda: _figure_layers(figure)),
+            ("alpha", lambda: _figure_layers(figure, hidden.shape)),
             ("beta", lambda: self._beta_layers(beta, hidden, unknown, figure)),
         )
         # One after the other, so that no two are held at once.
@@ -323,12 +329,12 @@ class _Take:
 
     def _figure(self, frame: Frame, shown: _Shown) -> _Figure:
         if self.alpha is not None:
-            alpha = _matte_plane(self.alpha.path(frame))
-            box = around(alpha > 0, MARGIN) or _NONE
+            matte = _matte_plane(self.alpha.path(frame))
+            box = around(matte > 0, MARGIN) or _NONE
+            alpha, image = matte[box].copy(), shown.at(box)
             backdrop, unknown = self.scene.backdrop.at(box), self.scene.unknown[box]
-            image = shown.at(box)
-            figure = colour_figure(image, backdrop, unknown, alpha[box])
-            return _Figure(alpha, None, box, figure.foreground, without_figure(image, figure))
+            figure = colour_figure(image, backdrop, unknown, alpha)
+            return _Figure(None, box, alpha, figure.foreground, without_figure(image, figure))
         return self._pulled(frame, shown)
 
     def _pulled(self, frame: Frame, shown: _Shown) -> _Figure:
@@ -337,12 +343,11 @@ class _Take:
         mask = self._differs(shown)
         if drawn and given is not None:
             mask |= given == FIGURE
-        alpha, trimap = np.zeros(mask.shape, np.float32), np.zeros(mask.shape, np.uint8)
+        trimap = np.zeros(mask.shape, np.uint8)
         made = given if drawn else trimap
         box = around(mask, MARGIN)
         if box is None:
-            nothing = np.zeros((0, 0, 3), np.float32)
-            return _Figure(alpha, made, _NONE, nothing, nothing)
+            return _Figure.none(made)
         image, part = shown.at(box), None if given is None else given[box]
         figure = pull_figure(
             image,
@@ -352,9 +357,9 @@ class _Take:
             hint=None if drawn else part,
             frame_size=mask.shape,
         )
-        alpha[box], trimap[box] = figure.alpha, figure.trimap
+        trimap[box] = figure.trimap
         ground = without_figure(image, figure)
-        return _Figure(alpha, made, box, figure.foreground, ground)
+        return _Figure(made, box, figure.alpha, figure.foreground, ground)
 
     def _differs(self, shown: _Shown) -> Bool:
         """Where a frame is not plainly lit ground, a few rows at a time."""
@@ -377,7 +382,7 @@ class _Take:
         self, beta: Float32, hidden: Bool, unknown: Bool, figure: _Figure
     ) -> dict[str, NDArray[np.float16]]:
         confidence = self.scene.confidence.copy()
-        seen = 1 - figure.alpha[figure.box]
+        seen = 1 - figure.alpha
         confidence[figure.box] = to_half(to_float(confidence[figure.box]) * seen)
         confidence[unknown] = 0
         name = "Y" if self.beta == "scalar" else "RGB"
@@ -391,11 +396,11 @@ class _Take:
         return np.dstack([shadow_beta.fill_beta(p, reached, hidden, self.fill) for p in planes])
 
 
-def _figure_layers(figure: _Figure) -> dict[str, NDArray[np.float16]]:
-    rgba = np.zeros((*figure.alpha.shape, 4), np.float16)
+def _figure_layers(figure: _Figure, shape: tuple[int, ...]) -> dict[str, NDArray[np.float16]]:
+    rgba = np.zeros((*shape, 4), np.float16)
     # What is never written to takes no memory.
     part = rgba[figure.box]
-    part[..., :3], part[..., 3] = to_half(figure.foreground), to_half(figure.alpha[figure.box])
+    part[..., :3], part[..., 3] = to_half(figure.foreground), to_half(figure.alpha)
     return {"RGBA": rgba}
 
 

@@ -97,16 +97,18 @@ def _plate(folder: Path, name: str) -> Path:
 
 def plate_layers(
     folder: Path, plates: Plates, contrast: NDArray[np.float32]
-) -> dict[Path, dict[str, NDArray[np.float32]]]:
+) -> dict[Path, dict[str, NDArray[np.floating]]]:
     """What is to be written for plates: layers by file; lit, shadow and confidence (channels
     contrast, frames, and shadow_frames for plates that are not extremes).
 
-    Of the contrast as many digits are kept as a half has: the others say nothing, and take up most
-    of the room.
+    The contrast becomes a half: further digits of it say nothing, and take up most of the room.
     """
     lit, shadow, confidence = plate_files(folder)
     frames = plates.frames if plates.frames is not None else np.zeros(contrast.shape)
-    layers = {"contrast": to_float(to_half(contrast)), "frames": frames.astype(np.float32)}
+    layers: dict[str, NDArray[np.floating]] = {
+        "contrast": to_half(contrast),
+        "frames": frames.astype(np.float32),
+    }
     if plates.shadow_frames is not None:
         layers["shadow_frames"] = plates.shadow_frames.astype(np.float32)
     return {lit: {"RGB": plates.lit}, shadow: {"RGB": plates.shadow}, confidence: layers}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shadowtool.choices import Estimator, Gain, Missing
 from shadowtool.core.beta import shadow_contrast
 from shadowtool.core.exposure import common_reference, frame_gain, without_gain
-from shadowtool.core.half_floats import shortened
+from shadowtool.core.half_floats import not_finite, shortened
 from shadowtool.core.holdout import (
     Background,
     figure_mask,
@@ -137,7 +137,8 @@ def plate(
             estimate = _robust(take, frames, automatic, region)
     if len(take.used) < 2:
         logger.warning("%s: one frame shows no moving shadow", footage.sequence.pattern)
-    unseen = int(np.isnan(estimate.lit).any(axis=-1).sum())
+    missed = not_finite(estimate.lit)
+    unseen = 0 if missed is None else int(np.count_nonzero(missed))
     pixels = estimate.lit.shape[0] * estimate.lit.shape[1]
     if unseen == pixels:
         raise InputError(_nothing_seen(take))
@@ -154,7 +155,7 @@ def plate(
         "noise_at_mid_grey": [round(float(v), 6) for v in estimate.noise.sigma(np.full(3, 0.18))],
     }
 
-    def products() -> Iterator[tuple[Path, dict[str, NDArray[np.float32]]]]:
+    def products() -> Iterator[tuple[Path, dict[str, NDArray[np.floating]]]]:
         # Each is encoded while the next one is made.
         lit, shadow, confidence = plate_files(output)
         yield lit, {"RGB": estimate.lit}
@@ -164,7 +165,7 @@ def plate(
         contrast = shadow_contrast(plates, estimate.noise)
         yield confidence, plate_layers(output, plates, contrast)[confidence]
 
-    def write(item: tuple[Path, dict[str, NDArray[np.float32]]]) -> None:
+    def write(item: tuple[Path, dict[str, NDArray[np.floating]]]) -> None:
         write_exr(item[0], item[1], footage.header, provenance, quick=True)
 
     for _ in ordered_map(write, products(), run.jobs):

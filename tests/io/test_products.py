@@ -110,7 +110,7 @@ def test_the_plates_confidence_has_contrast_and_frames(tmp_path):
     image = read_image(tmp_path / "confidence.exr")
     assert set(image.layers) == {"contrast", "frames"}
     np.testing.assert_allclose(image.plane("contrast"), contrast, rtol=1e-3)
-    assert image.layers["contrast"].dtype == np.float32
+    assert image.layers["contrast"].dtype == np.float16
     assert image.header.provenance == MADE
 
 

@@ -161,3 +161,14 @@ def tree() -> Callable[[Path], dict[str, bytes]]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
+
+
+@pytest.fixture
+def narrow_bands(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """From the call on, even small pictures are worked through in many bands."""
+
+    def narrow() -> None:
+        for name in ("bands._VALUES", "beta._PIXELS", "crossings._BLOCK"):
+            monkeypatch.setattr(f"shadowtool.core.{name}", 1000)
+
+    return narrow

@@ -25,7 +25,7 @@ _LONGEST = 1000
 _AGAIN = 0.5
 # Of GNU's C library: how much of what is freed stays, from which size on pieces come from the
 # system each for itself, and how many threads have memory of their own; `mallopt`'s numbers.
-_ALLOCATION = {-1: 1 << 30, -3: 1 << 24, -8: 1}
+_ALLOCATION = {-1: 1 << 30, -3: 1 << 25, -8: 1}
 
 
 class _Terminated(BaseException):

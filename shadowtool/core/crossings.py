@@ -30,8 +30,9 @@ _NEARLY_LIT_KEYS = np.int16(41)
 # that take longer than about forty frames are not worth having.
 _BYTES, _LEAST, _MOST = 2**28, 8, 27
 _WAITING = 1 / 4
-# Pixels that are looked at together, so that all that is known of them is in the cache.
-_BLOCK = 1 << 17
+# Pixels that are looked at together: an array of as many keys is 1 MB. With fewer, this thread
+# would wait for those that read at every step.
+_BLOCK = 1 << 19
 # The key of NaN, beyond all others; and one below all others.
 _UNKNOWN, _LOWEST = np.int16(0x7E00), np.int16(-0x8000)
 _INFINITE = 0x7C00

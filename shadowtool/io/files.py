@@ -5,7 +5,6 @@ import errno
 import io
 import itertools
 import os
-import socket
 import threading
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,12 +21,12 @@ _RETRY = {
     for name in ("ENOSPC", "EDQUOT", "ESTALE", "EIO", "ETIMEDOUT", "EAGAIN", "ENFILE", "EMFILE")
     if hasattr(errno, name)
 }
-_HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
+_HOST = f"{zlib.crc32(os.uname().nodename.encode()):08x}"
 _SAMPLE, _SAMPLES = 1 << 16, 256
 # A prime number of words: no row of pixels, and no page, is a multiple of it.
 _FOLD = 4099
 # Bytes that are read at a time, a multiple of the fold's.
-_BLOCK = 8 * 8 * _FOLD
+_BLOCK = 8 * 32 * _FOLD
 _counter = itertools.count()
 
 

@@ -117,6 +117,12 @@ def test_keyframes_give_the_same_bits_whatever_the_jobs_and_the_split(
         assert tree(parts / folder) == tree(whole / folder)
 
 
+def test_bands_change_no_bit(pull: Callable[..., Path], tree, narrow_bands) -> None:
+    whole = pull("whole")
+    narrow_bands()
+    assert tree(pull("narrow")) == tree(whole)
+
+
 def test_frames_far_from_any_keyframe_do_without(
     pull: Callable[..., Path],
     take: Path,

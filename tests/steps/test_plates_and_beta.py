@@ -177,9 +177,10 @@ def test_minmax_is_the_extremes_bit_for_bit(takes: Path, tmp_path: Path) -> None
     assert (found.frames == FRAMES).all()
 
 
-def test_the_number_of_threads_changes_no_bit(
-    takes: Path, walk_plates: Path, tmp_path: Path, tree
+def test_threads_and_bands_change_no_bit(
+    takes: Path, walk_plates: Path, tmp_path: Path, tree, narrow_bands
 ) -> None:
+    narrow_bands()
     plate(takes / "walk", tmp_path / "plates", run=Run(jobs=1))
     assert tree(tmp_path / "plates") == tree(walk_plates)
 

@@ -386,14 +386,19 @@ class _Take:
         confidence[figure.box] = to_half(to_float(confidence[figure.box]) * seen)
         confidence[unknown] = 0
         name = "Y" if self.beta == "scalar" else "RGB"
-        return {name: to_half(self._filled(beta, hidden)), "confidence": confidence}
+        return {name: self._filled(beta, hidden), "confidence": confidence}
 
-    def _filled(self, beta: Float32, hidden: Bool) -> Float32:
+    def _filled(self, beta: Float32, hidden: Bool) -> Float16:
+        filled = np.empty(beta.shape, np.float16)
         reached = self.scene.never_reached
-        if beta.ndim == 2:
-            return shadow_beta.fill_beta(beta, reached, hidden, self.fill)
-        planes = [beta[..., channel] for channel in range(3)]
-        return np.dstack([shadow_beta.fill_beta(p, reached, hidden, self.fill) for p in planes])
+        for plane, out in zip(_planes(beta), _planes(filled), strict=True):
+            out[:] = to_half(shadow_beta.fill_beta(plane, reached, hidden, self.fill))
+        return filled
+
+
+def _planes(image: NDArray[np.floating]) -> list[NDArray[np.floating]]:
+    """Views of an image's channels, (H, W) each."""
+    return [image] if image.ndim == 2 else [image[..., channel] for channel in range(3)]
 
 
 def _figure_layers(figure: _Figure, shape: tuple[int, ...]) -> dict[str, NDArray[np.float16]]:

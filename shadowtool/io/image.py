@@ -60,6 +60,7 @@ class Header:
         frame_rate: frames per second, if the file says so.
         time_code: OpenEXR's TimeCode, if the file has one.
         coloured: whether there is more than one channel.
+        bits: of each integer sample; None for floating point.
         provenance: how a file of ours was made: our attributes without their prefix.
     """
 
@@ -70,6 +71,7 @@ class Header:
     frame_rate: Fraction | None = None
     time_code: Any = None
     coloured: bool = True
+    bits: int | None = None
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -492,8 +494,9 @@ def _png_header(path: Path, data: bytes) -> Header:
     width, height = struct.unpack(">II", data[16:24])
     if not 0 < width * height <= _MOST_PIXELS:
         raise InputError(f"{path}: claims {width}x{height} pixels; that can't be right")
-    # The ninth byte of IHDR: 0 is grey alone.
-    return Header(width, height, coloured=data[25] != 0, provenance=_png_texts(data))
+    # Fewer than 8 bits are decoded to 8. A colour type of 0 is grey alone.
+    bits, kind = max(data[24], 8), data[25]
+    return Header(width, height, coloured=kind != 0, bits=bits, provenance=_png_texts(data))
 
 
 def _png_texts(data: bytes) -> dict[str, str]:

@@ -21,7 +21,14 @@ Float32 = NDArray[np.float32]
 _TRANSFERS = {1: "rec709", 6: "rec709", 14: "rec709", 15: "rec709", 13: "srgb", 8: "linear"}
 _UNSPECIFIED = {0, 2}
 # Red's and blue's share of luma, by matrix coefficients.
-_MATRICES = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
+_MATRICES = {
+    1: (0.2126, 0.0722),
+    4: (0.3, 0.11),
+    5: (0.299, 0.114),
+    6: (0.299, 0.114),
+    7: (0.212, 0.087),
+    9: (0.2627, 0.0593),
+}
 _FULL_RANGE = 2
 
 
@@ -31,21 +38,23 @@ class MovieInfo:
 
     Attributes:
         frame_rate: frames per second, None if the container has none.
-        pixel_format: FFmpeg's name.
+        pixel_aspect: width of a pixel over its height.
         bits: of each stored sample.
         transfer: the transfer function's name; None if it is one that we can't undo.
         frames: how many there are, if the container says so.
-        assumed: sentences about what the file left open.
+        assumed: sentences about what the file left open, apart from the transfer function.
+        assumed_transfer: such a sentence about that; empty if the file names one.
     """
 
     width: int
     height: int
+    pixel_aspect: float
     frame_rate: Fraction | None
-    pixel_format: str
     bits: int
     transfer: str | None
     frames: int | None
     assumed: tuple[str, ...]
+    assumed_transfer: str
 
 
 @dataclass(frozen=True)
@@ -56,11 +65,13 @@ class MovieFrame:
         position: counted from 0.
         seconds: presentation time, None if unknown.
         coded: (H, W, 3) float32 RGB code values, 0 to 1 nominal.
+        damaged: the decoder made up a part of it, or of a frame that it may be made from.
     """
 
     position: int
     seconds: float | None
     coded: Float32
+    damaged: bool = False
 
 
 class Movie:
@@ -76,7 +87,9 @@ class Movie:
             self._container = av.open(str(path))
             self._stream = self._container.streams.video[0]
         except (FFmpegError, OSError, ValueError, IndexError):
-            raise InputError(f"{path}: no movie that can be decoded") from None
+            raise InputError(
+                f"{path}: neither a movie that can be decoded nor EXR or PNG frames"
+            ) from None
         kind = self._container.format.name
         # FFmpeg shows any text as a movie of a terminal.
         if kind in ("image2", "tty") or kind.endswith("_pipe"):
@@ -84,19 +97,17 @@ class Movie:
         self._stream.thread_type = "AUTO"
         self.info = self._describe()
 
-    def close(self) -> None:
-        self._container.close()
-
     def frames(self) -> Iterator[MovieFrame]:
         """All frames in order.
 
         Raises:
             DamagedFileError: decoding fails.
         """
-        position = 0
+        position, damaged = 0, False
         try:
             for frame in self._container.decode(self._stream):
-                yield MovieFrame(position, frame.time, self._coded(frame))
+                damaged = bool(frame.is_corrupt or (damaged and not frame.key_frame))
+                yield MovieFrame(position, frame.time, self._coded(frame), damaged)
                 position += 1
         except FFmpegError as error:
             raise DamagedFileError(
@@ -112,22 +123,24 @@ class Movie:
         pixel_format = context.format
         if pixel_format is None:
             raise InputError(f"{self.path}: no movie that can be decoded")
-        assumed = []
+        assumed, assumed_transfer = [], ""
         trc = int(context.color_trc)
         transfer = _TRANSFERS.get(trc)
         if trc in _UNSPECIFIED:
             transfer = "rec709"
-            assumed.append("the movie names no transfer function: Rec.709 is assumed")
+            assumed_transfer = "the movie names no transfer function: Rec.709 is assumed"
         self._rgb = pixel_format.is_rgb
         self._gray = len(pixel_format.components) < 3
         matrix = int(context.colorspace)
         self._full = int(context.color_range) == _FULL_RANGE or pixel_format.name.startswith("yuvj")
         if not self._rgb and not self._gray:
-            if matrix not in _MATRICES:
+            if (code := matrix) not in _MATRICES:
+                named = code not in _UNSPECIFIED
                 high = context.width > 1024 or context.height > 576
                 matrix = 1 if high else 6
                 name = "Rec.709" if high else "Rec.601"
-                assumed.append(f"the movie names no colour matrix: {name} is assumed by its size")
+                said = f"matrix {code}, which is not known here" if named else "no colour matrix"
+                assumed.append(f"the movie names {said}: {name} is assumed by its size")
             self._weights = _MATRICES[matrix]
         if not self._rgb and int(context.color_range) == 0 and not self._full:
             assumed.append("the movie names no range: video range (16-235) is assumed")
@@ -137,11 +150,12 @@ class Movie:
             width=context.width,
             height=context.height,
             frame_rate=Fraction(rate) if rate else None,
-            pixel_format=pixel_format.name,
+            pixel_aspect=float(self._stream.sample_aspect_ratio or 1),
             bits=bits,
             frames=self._stream.frames or None,
             transfer=transfer,
             assumed=tuple(assumed),
+            assumed_transfer=assumed_transfer,
         )
 
     def _coded(self, frame: av.VideoFrame) -> Float32:
@@ -222,15 +236,6 @@ def _full_size(chroma: Float32, width: int, height: int) -> Float32:
         tall = cv2.resize(np.ascontiguousarray(chroma), double, interpolation=cv2.INTER_LINEAR)
         chroma = np.asarray(tall, np.float32)[:height]
     return chroma
-
-
-def is_movie(path: Path) -> bool:
-    """Whether the file opens as a movie; still pictures and text do not count."""
-    try:
-        Movie(path).close()
-    except InputError:
-        return False
-    return True
 
 
 def camera_frames(device: int, seconds: float) -> Iterator[MovieFrame]:

@@ -2,7 +2,6 @@
 
 import itertools
 import logging
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -17,8 +16,14 @@ from shadowtool.core import camera_motion
 from shadowtool.core.noise import NoiseSamples, noise_levels
 from shadowtool.core.shadow_time import luminance
 from shadowtool.core.transfer import TRANSFERS
-from shadowtool.errors import DamagedFileError, InputError, OptionError, ReshootError
-from shadowtool.io.files import make_folder
+from shadowtool.errors import (
+    DamagedFileError,
+    InputError,
+    OptionError,
+    OutputExistsError,
+    ReshootError,
+)
+from shadowtool.io.files import new_folders
 from shadowtool.io.image import EXR, PNG, Header, to_code, to_half, write_exr, write_png
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame, frame_file, frame_range
@@ -31,6 +36,7 @@ from shadowtool.steps.run import (
     Run,
     current,
     refuse_existing,
+    refuse_other_step,
     write_manifest,
 )
 
@@ -114,20 +120,31 @@ def capture(
         {"input": opened.name},
     )
     suffix = EXR if file_format == "exr" else PNG
-    name = output.resolve().name
+    # Frames whose names begin with a dot would be hidden.
+    name = output.resolve().name.lstrip(".")
+    if not name.isprintable() or not name:
+        raise OptionError(f"-o {str(output)!r}: frames are named after it; give a plain name")
     taking = _Taking(opened, recipe, output, name, suffix, transfer, crop, size, run)
     mark = recipe.fingerprint([opened.fingerprint])
+    refuse_other_step("capture", output, run)
     if opened.folder is not None and output.resolve() == opened.folder.resolve():
         raise OptionError(f"{output}: is the folder of the frames to capture; give another -o")
     if run.resume and (kept := taking.kept(mark)) is not None:
+        if strict:
+            _require_still(opened.name, kept.figures["camera_motion"])
         return kept
+    there = sorted(output.iterdir()) if output.is_dir() else []
+    for file in there:
+        if file.name.startswith(f"{name}.") and file.suffix in {EXR, PNG} - {suffix}:
+            raise OutputExistsError(f"{file}: a frame in another format; give another folder")
     if opened.wanted is not None:
         refuse_existing(map(taking.place, opened.wanted), run)
-    elif output.is_dir():
-        refuse_existing(sorted(f for f in output.iterdir() if f.suffix == suffix), run)
-    frames, skipped, report = taking.take()
-    if not frames:
-        raise InputError(f"{opened.name}: no frame of the wanted range is in it")
+    else:
+        refuse_existing((file for file in there if file.suffix == suffix), run)
+    with new_folders([output]):
+        frames, skipped, report = taking.take()
+        if not frames:
+            raise InputError(f"{opened.name}: no frame of the wanted range is in it")
     absent = [f for f in opened.wanted or () if f not in frames and f not in skipped]
     if absent and run.missing == "error":
         raise InputError(
@@ -142,10 +159,20 @@ def capture(
         )
     record = _record(opened, report, frames, transfer, size)
     write_json(output / RECORD, record)
+    _warn(record, output)
+    motion = record["camera_motion"]
+    if strict:
+        _require_still(opened.name, motion)
+    elif motion["moved_at"] != "never":
+        logger.warning("%s", _moved(opened.name, motion))
     taking.finish(mark, report.marks)
-    _warn(record, strict, output)
     return Result(
-        "capture", output, frames, 0, [*opened.absent, *skipped, *absent], _figures(record)
+        "capture",
+        output,
+        frames,
+        report.kept,
+        [*opened.absent, *skipped, *absent],
+        _figures(record),
     )
 
 
@@ -156,6 +183,7 @@ class _Measured(NamedTuple):
     linear: Float32
     shift: float | None
     clipped: float
+    kept: bool
 
 
 @dataclass
@@ -168,6 +196,7 @@ class _Report:
     seconds: list[tuple[Frame, float]] = field(default_factory=list)
     clipped: list[float] = field(default_factory=list)
     marks: dict[str, str] = field(default_factory=dict)
+    kept: int = 0
     before: Float32 | None = None
 
     def add(self, measured: _Measured) -> None:
@@ -179,6 +208,7 @@ class _Report:
         self.before = grid
         self.shifts[str(frame)] = measured.shift
         self.clipped.append(measured.clipped)
+        self.kept += measured.kept
         if seconds is not None:
             self.seconds.append((frame, seconds))
 
@@ -226,25 +256,13 @@ class _Taking:
     def take(self) -> tuple[list[Frame], list[Frame], _Report]:
         """Write all frames; those written, those skipped, and what was measured."""
         report, frames, skipped = _Report(), list[Frame](), list[Frame]()
-        reference: list[Float32] = []
-
-        def prepared() -> Iterator[Arriving]:
-            for arriving in self.source.arriving:
-                # The first frame that can be read is what the camera's motion is measured from.
-                if not reference:
-                    try:
-                        linear = self._linear(arriving.load().values)
-                    except DamagedFileError:
-                        if self.run.missing == "error":
-                            raise
-                    else:
-                        make_folder(self.output)
-                        reference.append(camera_motion.prepare(luminance(linear)))
-                yield arriving
+        # The camera's motion is measured from the first frame of all, whichever are wanted.
+        first = self.source.earliest()
+        reference = None if first is None else self._prepared(self._linear(first.values))
 
         def work(arriving: Arriving) -> _Measured | Frame:
             try:
-                return self._write(arriving, reference[0] if reference else None)
+                return self._write(arriving, reference)
             except DamagedFileError:
                 if self.run.missing == "error":
                     raise
@@ -252,7 +270,9 @@ class _Taking:
 
         total = self.source.total
         self.run.progress(0, total)
-        for number, done in enumerate(ordered_map(work, prepared(), self.run.jobs), start=1):
+        for number, done in enumerate(
+            ordered_map(work, self.source.arriving, self.run.jobs), start=1
+        ):
             if isinstance(done, _Measured):
                 frames.append(done.arriving.frame)
                 report.add(done)
@@ -268,7 +288,8 @@ class _Taking:
         loaded = arriving.load()
         linear = self._linear(loaded.values)
         path, mark = self.place(arriving.frame), self.mark(arriving)
-        if not (self.run.resume and current([path], mark) is not None):
+        kept = self.run.resume and current([path], mark) is not None
+        if not kept:
             provenance = self.recipe.provenance(mark)
             if self.suffix == EXR:
                 width, height = self.size
@@ -277,10 +298,15 @@ class _Taking:
                 write_exr(path, {"RGB": to_half(linear)}, header, provenance)
             else:
                 write_png(path, to_code(linear), provenance)
-        gray = camera_motion.prepare(luminance(linear))
+        gray = self._prepared(linear)
         shift = None if reference is None else camera_motion.shift(reference, gray, self.size[0])
         top = _LARGEST_HALF if self.source.bits is None else _CLIPPED_CODE
-        return _Measured(arriving, linear, shift, float((loaded.values >= top).any(axis=-1).mean()))
+        clipped = float((loaded.values >= top).any(axis=-1).mean())
+        return _Measured(arriving, linear, shift, clipped, kept)
+
+    @staticmethod
+    def _prepared(linear: Float32) -> Float32:
+        return camera_motion.prepare(luminance(linear))
 
     def _linear(self, coded: NDArray[np.floating]) -> Float32:
         values = TRANSFERS[self.transfer].decode(coded)
@@ -294,19 +320,18 @@ class _Taking:
         return values
 
     def kept(self, mark: str) -> Result | None:
-        """The result of an earlier run of the same, if all that it wrote is there and whole."""
+        """The result of an earlier run of the same, if all that is wanted is there and whole; what
+        a movie has without being asked for certain frames is known only when it has been read."""
         manifest = read_record(self.output / MANIFEST)
         rows, record = manifest.get("frames"), read_record(self.output / RECORD)
-        if manifest.get("fingerprint") != mark or not isinstance(rows, dict) or not record:
+        frames = self.source.wanted
+        if frames is None or manifest.get("fingerprint") != mark or not isinstance(rows, dict):
             return None
-        wanted = self.source.wanted
-        numbers = [str(frame) for frame in wanted] if wanted is not None else list(rows)
-        try:
-            frames: list[Frame] = list(wanted) if wanted is not None else [int(n) for n in numbers]
-        except ValueError:
+        if not isinstance(record.get("camera_motion"), dict):
             return None
         for frame in frames:
-            mark = str(rows.get(str(frame), {}).get("fingerprint"))
+            row = rows.get(str(frame))
+            mark = str(row.get("fingerprint")) if isinstance(row, dict) else ""
             if self.source.marks:
                 mark = self.recipe.fingerprint([self.source.marks[frame]])
             if current([self.place(frame)], mark) is None:
@@ -374,7 +399,7 @@ def _figures(record: dict[str, Any]) -> Figures:
     return {key: record.get(key) for key in _FIGURES}
 
 
-def _warn(record: dict[str, Any], strict: bool, output: Path) -> None:
+def _warn(record: dict[str, Any], output: Path) -> None:
     for sentence in record["assumed"]:
         logger.warning("%s: %s", record["input"], sentence)
     for what in ("dropped", "doubled"):
@@ -382,13 +407,16 @@ def _warn(record: dict[str, Any], strict: bool, output: Path) -> None:
             logger.warning("%s: %s frames at %s", record["input"], what, ", ".join(record[what]))
     if record["clipped"] > 0.001:
         logger.warning("%s: %.1f%% of the pixels are clipped", output, 100 * record["clipped"])
-    motion = record["camera_motion"]
-    if motion["moved_at"] != "never":
-        message = (
-            f"{record['input']}: the camera moved, first seen in frame {motion['moved_at']}, by up"
-            f" to {motion['largest']:.2f} pixels in frame {motion['largest_at']};"
-            " stabilise the take or shoot it again"
-        )
-        if strict:
-            raise ReshootError(message)
-        logger.warning("%s", message)
+
+
+def _require_still(name: str, motion: dict[str, Any]) -> None:
+    if motion.get("moved_at", "never") != "never":
+        raise ReshootError(_moved(name, motion))
+
+
+def _moved(name: str, motion: dict[str, Any]) -> str:
+    return (
+        f"{name}: the camera moved, first seen in frame {motion.get('moved_at')}, by up to"
+        f" {motion.get('largest')} pixels in frame {motion.get('largest_at')};"
+        " stabilise the take or shoot it again"
+    )

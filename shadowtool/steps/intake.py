@@ -2,8 +2,8 @@
 
 import uuid
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Missing
-from shadowtool.errors import InputError, OptionError
+from shadowtool.errors import DamagedFileError, InputError, OptionError
 from shadowtool.io.files import fingerprint_file, fingerprint_movie
-from shadowtool.io.image import EXR, PNG, Header, read_image
+from shadowtool.io.image import EXR, PNG, Header
 from shadowtool.io.sequence import Frame, parse_frames
-from shadowtool.io.video import Movie, camera_frames, is_movie
+from shadowtool.io.video import Movie, MovieFrame, camera_frames
 from shadowtool.steps.footage import open_footage
 
 FIRST_FRAME = 1001
@@ -61,6 +61,7 @@ class Source:
         wanted: the numbers of the frames that were asked for; None for whatever comes.
         total: how many frames there will be, 0 if unknown.
         arriving: the frames, in order; to be gone through once.
+        earliest: reads the first frame of all that can be read, wanted or not; None for none.
         absent: frames that are known to be missing.
         folder: where a sequence's files are.
         marks: fingerprint of each wanted frame, where they can be told apart; else empty.
@@ -75,6 +76,7 @@ class Source:
     wanted: list[Frame] | None
     total: int
     arriving: Iterator[Arriving]
+    earliest: Callable[[], Loaded | None]
     absent: list[Frame] = field(default_factory=list)
     folder: Path | None = None
     marks: dict[Frame, str] = field(default_factory=dict)
@@ -99,19 +101,15 @@ def open_source(
     if device is not None:
         if source is not None or seconds is None or seconds <= 0:
             raise OptionError("--device N takes --seconds T and no INPUT")
-        return _camera(device, seconds, FIRST_FRAME if start is None else start)
+        return _camera(device, seconds, transfer, FIRST_FRAME if start is None else start)
+    if seconds is not None:
+        raise OptionError("--seconds T goes with --device N, not with an INPUT")
     if source is None:
         raise OptionError("give a movie, a sequence, or --device N --seconds T")
     path = Path(source)
     if path.is_file() and path.suffix.lower() not in (EXR, PNG):
-        if not is_movie(path):
-            raise InputError(f"{path}: neither a movie that can be decoded nor EXR or PNG frames")
         return _movie(path, frames, transfer, FIRST_FRAME if start is None else start)
     return _sequence(source, frames, missing, transfer, start)
-
-
-def _same(loaded: Loaded) -> Loaded:
-    return loaded
 
 
 def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
@@ -122,29 +120,46 @@ def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
     wanted = None if frames is None else parse_frames(frames)
     chosen = None if wanted is None else set(wanted)
     mark = fingerprint_movie(path)
-    header = Header(info.width, info.height, frame_rate=info.frame_rate)
+    header = Header(
+        info.width, info.height, pixel_aspect=info.pixel_aspect, frame_rate=info.frame_rate
+    )
+
+    def load(item: MovieFrame) -> Loaded:
+        if item.damaged:
+            raise DamagedFileError(
+                f"{path}: its frame at position {item.position} is damaged; copy the movie again,"
+                " or go on without it by --missing skip"
+            )
+        return Loaded(item.coded, header)
 
     def arriving() -> Iterator[Arriving]:
         for item in movie.frames():
             frame = start + item.position
             if chosen is None or frame in chosen:
-                loaded = Loaded(item.coded, header)
-                yield Arriving(
-                    frame, item.seconds, f"{mark} {item.position}", partial(_same, loaded)
-                )
+                yield Arriving(frame, item.seconds, f"{mark} {item.position}", partial(load, item))
             if chosen is not None and frame >= max(chosen):
                 return
+
+    def earliest() -> Loaded | None:
+        whole = (item for item in Movie(path).frames() if not item.damaged)
+        with suppress(DamagedFileError):
+            return next((load(item) for item in whole), None)
+        return None
 
     return Source(
         name=path.name,
         fingerprint=mark,
         header=header,
         transfer=info.transfer or transfer,
-        assumed=list(info.assumed),
+        assumed=[
+            *info.assumed,
+            *([info.assumed_transfer] if transfer == "auto" and info.assumed_transfer else []),
+        ],
         bits=info.bits,
         wanted=wanted,
         total=len(wanted) if wanted is not None else info.frames or 0,
         arriving=arriving(),
+        earliest=earliest,
     )
 
 
@@ -155,7 +170,6 @@ def _sequence(
     present, absent = footage.sequence.select(frames, missing)
     first = footage.sequence.frames[0]
     offset = 0 if start is None else start - first
-    rate = footage.header.frame_rate
     png = footage.sequence.path(present[0]).suffix.lower() == PNG
     marks = {frame: fingerprint_file(footage.sequence.path(frame)) for frame in present}
 
@@ -165,49 +179,54 @@ def _sequence(
 
     def arriving() -> Iterator[Arriving]:
         for frame in present:
-            seconds = None if rate is None else float(Fraction(frame - first) / rate)
-            yield Arriving(frame + offset, seconds, marks[frame], partial(load, frame))
+            yield Arriving(frame + offset, None, marks[frame], partial(load, frame))
 
-    bits = None
-    if png:
-        stored = next(iter(read_image(footage.sequence.path(present[0])).layers.values()))
-        bits = 8 * stored.dtype.itemsize
+    def earliest() -> Loaded | None:
+        for frame in footage.sequence.frames:
+            with suppress(InputError):
+                return load(frame)
+        return None
+
     return Source(
         name=Path(footage.sequence.pattern).name,
         fingerprint="",
         header=footage.header,
         transfer=footage.transfer,
         assumed=[f"{'PNG' if png else 'EXR'} frames are taken as {footage.transfer}"],
-        bits=bits,
+        bits=footage.header.bits,
         wanted=[frame + offset for frame in present],
         total=len(present),
         arriving=arriving(),
+        earliest=earliest,
         absent=[frame + offset for frame in absent],
         folder=Path(footage.sequence.pattern).parent,
         marks={frame + offset: mark for frame, mark in marks.items()},
     )
 
 
-def _camera(device: int, seconds: float, start: int) -> Source:
+def _camera(device: int, seconds: float, transfer: str, start: int) -> Source:
     frames = camera_frames(device, seconds)
     first = next(frames)
     header = Header(first.coded.shape[1], first.coded.shape[0])
     # A recording is never the same twice.
     mark = uuid.uuid4().hex
 
+    def load(item: MovieFrame) -> Loaded:
+        return Loaded(item.coded, header)
+
     def arriving() -> Iterator[Arriving]:
         for item in chain([first], frames):
-            loaded = Loaded(item.coded, header)
-            yield Arriving(start + item.position, item.seconds, mark, partial(_same, loaded))
+            yield Arriving(start + item.position, item.seconds, mark, partial(load, item))
 
     return Source(
         name=f"camera {device}",
         fingerprint=mark,
         header=header,
         transfer="srgb",
-        assumed=["cameras are taken as sRGB-encoded, 8 bit"],
+        assumed=["cameras are taken as sRGB-encoded, 8 bit"] if transfer == "auto" else [],
         bits=8,
         wanted=None,
         total=0,
         arriving=arriving(),
+        earliest=lambda: load(first),
     )

@@ -376,7 +376,7 @@ def test_a_matte_without_its_parts(part, shot, copied, refused):
 def test_no_matte_at_all(shot, refused, tmp_path):
     said = refused(replaced(shot.arguments("composite"), 1, tmp_path / "nowhere"))
     assert "nowhere" in said
-    assert "--fg" in refused(["composite", "--plates", shot.plates])
+    assert "--fg" in refused(["composite", "--plates", shot.plates], code=2)
 
 
 @pytest.mark.parametrize("part", ["fg", "beta"])
@@ -488,6 +488,62 @@ def test_a_crop_that_cannot_be_read(crop, shot, misused):
 )
 def test_capture_options_that_do_not_fit(options, shot, refused):
     assert options[0] in refused(shot.arguments("capture"), *options, code=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("apply", ["--outside", "nan"]),
+        ("apply", ["--outside", "inf"]),
+        ("matte", ["--alpha", "matte/fg", "--trimap", "matte/trimap"]),
+        ("plate", ["--plane", "0,0 40,0 40,30", "--estimator", "minmax"]),
+        ("capture", ["--seconds", "3"]),
+    ],
+)
+def test_options_that_would_do_nothing(name, options, shot, refused):
+    words = [str(shot.folder / word) if "/" in word else word for word in options]
+    assert options[0] in refused(shot.arguments(name), *words, code=2)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_empty_output_folder_is_none(name, shot, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = command(*shot.arguments(name), "-o", "")
+    assert outcome.code == 2
+    assert "empty" in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["capture", "plate", "scan", "warp", "composite"])
+def test_the_record_of_another_step_is_kept(name, shot, refused, copied):
+    other = copied("matte")
+    said = refused(shot.arguments(name), "--resume", output=other)
+    assert "is the record of matte" in said
+
+
+def test_a_take_in_two_formats_is_none(shot, refused, command, tmp_path):
+    words = [*shot.arguments("capture"), "-o", tmp_path / "out"]
+    assert command(*words, "--format", "png", "-q").code == 0
+    assert "another format" in refused(shot.arguments("capture"), "--overwrite")
+
+
+def test_a_step_does_not_write_over_what_it_reads(shot, command, copied, tree):
+    frames = copied("source")
+    before = tree(frames)
+    words = ["warp", "--map", shot.warp / "warp.exr", "--apply", frames, "-o", frames.parent]
+    for option in ("--resume", "--overwrite"):
+        outcome = command(*words, option)
+        assert outcome.code == 2
+        assert "source.1001.exr: is a frame to be read" in outcome.err
+        assert tree(frames) == before
+
+
+def test_a_full_standard_output_is_named(shot, tmp_path):
+    words = [*PROGRAM, *shot.arguments("plate"), "-o", str(tmp_path / "out")]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 75
+    assert "standard output: cannot write" in done.stderr
 
 
 def test_capture_of_nothing(refused):

@@ -9,10 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 
 from shadowtool.cli.options import PROGRESS
+from shadowtool.io.image import write_png
+from tests.conftest import write_frames
 
 COMMANDS = ("capture", "plate", "matte", "scan", "warp", "apply", "composite")
 PER_FRAME = ("capture", "matte", "apply", "composite")
@@ -457,6 +460,82 @@ def test_chunks_of_a_movie_equal_the_whole(movie, command, tmp_path, tree):
     frames = {path: data for path, data in tree(whole).items() if path.endswith(".exr")}
     assert {path: data for path, data in tree(parts).items() if path.endswith(".exr")} == frames
     assert tree(parts)["shadowtool.json"] == tree(whole)["shadowtool.json"]
+
+
+def test_resume_makes_the_rest_of_a_movie(movie, command, tmp_path, tree):
+    whole, part = tmp_path / "whole/take", tmp_path / "part/take"
+    assert command("capture", movie, "-o", whole, "-q").code == 0
+    assert command("capture", movie, "-o", part, "-q", "--frames", "1002-1003").code == 0
+    outcome = command("capture", movie, "-o", part, "--resume", "--json")
+    assert json.loads(outcome.out)["kept"] == 2
+    assert tree(part) == tree(whole)
+
+
+@pytest.fixture
+def jolted(tmp_path) -> Path:
+    """A take whose camera moves from frame 1004 on."""
+    texture = np.random.default_rng(2).random((80, 120, 3), np.float32)
+    texture = cv2.GaussianBlur(texture, (0, 0), 2).astype(np.float16)
+    views = (texture[:64, x : x + 96] for x in (8, 8, 8, 4, 4, 4))
+    return write_frames(tmp_path / "jolted", map(np.ascontiguousarray, views))
+
+
+def test_a_camera_that_moved_is_refused_again(jolted, command, tmp_path):
+    words = ["capture", jolted, "-o", tmp_path / "out", "--strict", "--resume"]
+    for _ in range(2):
+        outcome = command(*words)
+        assert outcome.code == 1
+        assert "the camera moved, first seen in frame 1004" in outcome.err
+        assert not (tmp_path / "out" / "shadowtool.json").exists()
+    assert command(*words[:-2], "--resume", "-q").code == 0
+    assert command(*words).code == 1
+
+
+def test_every_chunk_is_held_against_the_first_frame_of_all(jolted, command, tmp_path):
+    words = ["capture", jolted, "-o", tmp_path / "out", "--strict"]
+    assert command(*words, "--frames", "1001-1003").code == 0
+    outcome = command(*words, "--frames", "1004-1006")
+    assert outcome.code == 1
+    assert "first seen in frame 1004" in outcome.err
+
+
+def test_resume_of_plates_without_a_holdout_that_is_missing(shot, command, copied, tmp_path):
+    mattes = copied("matte") / "fg"
+    for number in range(1007, 1013):
+        (mattes / f"fg.{number}.exr").write_bytes((mattes / "fg.1001.exr").read_bytes())
+    (mattes / "fg.1003.exr").unlink()
+    words = [*shot.arguments("plate"), "--holdout", mattes, "--missing", "skip"]
+    for again in ([], ["--resume"]):
+        outcome = command(*words, "-o", tmp_path / "out", *again)
+        assert outcome.code == 3, outcome.err
+    assert "up to date" in outcome.out
+
+
+def test_a_damaged_first_picture_is_skipped_like_any(command, tmp_path):
+    folder = tmp_path / "take"
+    folder.mkdir()
+    for number in range(1001, 1005):
+        write_png(folder / f"a.{number}.png", np.full((32, 48, 3), 9 * number % 256, np.uint8))
+    first = folder / "a.1001.png"
+    first.write_bytes(first.read_bytes()[:-30])
+    outcome = command("capture", folder, "-o", tmp_path / "out", "--missing", "skip")
+    assert outcome.code == 3, outcome.err
+    assert "SKIPPED 1001" in outcome.out
+
+
+def test_the_record_says_how_to_run_the_step_again(shot, make):
+    recorded = {
+        ("matte", "--no-clamp"): "--no-clamp",
+        ("scan", "--plane", shot.folder / "mask.png"): "--plane mask.png",
+        ("warp", "--source-scan", shot.scan1, "--source-scan", shot.scan2): (
+            "scan1 scan2 --source-scan scan1 --source-scan scan2"
+        ),
+    }
+    for place, ((name, *options), said) in enumerate(recorded.items()):
+        words = shot.arguments(name)
+        words = [*words[: words.index("--plane")], *options] if name == "scan" else words + options
+        output = make(name, str(place), words=words)
+        assert said in json.loads((output / "shadowtool.json").read_text())["command"]
 
 
 def test_openjd_progress_of_a_movie_reaches_a_hundred_only_at_its_end(movie, command, tmp_path):

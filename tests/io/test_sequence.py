@@ -86,6 +86,20 @@ def test_a_pattern_picks_one_of_two_sequences(pattern, folder):
     }
 
 
+@pytest.mark.parametrize(
+    ("pattern", "found"), [("b.####.exr", 4), ("b.%04d.exr", 4), ("b.#.exr", 3), ("b.%d.exr", 3)]
+)
+def test_a_pattern_tells_sequences_apart_by_their_digits(pattern, found, folder):
+    place = folder(*(f"b.{n}.exr" for n in (1, 2, 3)), *(f"b.{n:04}.exr" for n in (1, 2, 3, 4)))
+    assert len(open_sequence(place / pattern)) == found
+
+
+def test_a_pattern_that_could_be_two_sequences_is_refused(folder):
+    place = folder("b.1.exr", "b.2.exr", "b.0001.exr", "b.0002.exr")
+    with pytest.raises(InputError, match="numbers of digits"):
+        open_sequence(place / "b.###.exr")
+
+
 def test_a_pattern_with_a_range_takes_that_range_only(folder):
     place = folder(*take("a", range(1001, 1010)))
     assert open_sequence(place / "a.1003-1007x2#.exr").frames == (1003, 1005, 1007)

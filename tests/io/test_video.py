@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shadowtool.errors import DamagedFileError, InputError
-from shadowtool.io.video import Movie, is_movie
+from shadowtool.io.video import Movie
 
 WIDTH, HEIGHT = 48, 32
 # Red's and blue's share of luma.
@@ -190,8 +190,34 @@ def test_without_tags_matrix_and_range_are_assumed_and_said_so(size, matrix, tmp
     np.testing.assert_allclose(rgb - exact, 0, atol=0.5 / 255)
     said = " ".join(movie.info.assumed)
     assert f"Rec.{matrix}" in said
-    assert "Rec.709 is assumed" in said
     assert "video range" in said
+    assert "Rec.709 is assumed" in movie.info.assumed_transfer
+
+
+def test_a_matrix_that_is_not_known_is_named(tmp_path):
+    planes = [flat(101, HEIGHT, WIDTH, 8)] + [flat(128, HEIGHT // 2, WIDTH // 2, 8)] * 2
+    path = write_movie(tmp_path / "a.mkv", "yuv420p", [planes], colorspace=8)
+    assert "matrix 8" in " ".join(Movie(path).info.assumed)
+
+
+def test_a_frame_that_the_decoder_made_up_is_damaged(tmp_path):
+    path = tmp_path / "a.mp4"
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 256, (64, 200, 3)).astype(np.uint8)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25, options={"g": "12"})
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for start in range(0, 96, 4):
+            part = np.ascontiguousarray(picture[:, start : start + 96])
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(part, format="rgb24")))
+        container.mux(stream.encode())
+    assert not any(frame.damaged for frame in Movie(path).frames())
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 10
+    data[middle : middle + 200] = bytes(rng.integers(0, 256, 200, np.uint8))
+    path.write_bytes(data)
+    # What is made from a damaged frame is no better, up to the next that stands alone.
+    assert [frame.damaged for frame in Movie(path).frames()] == [True] * 12 + [False] * 12
 
 
 def test_with_all_tags_nothing_is_assumed(tmp_path):
@@ -233,7 +259,6 @@ def test_frames_come_in_order_with_their_times(rate, tmp_path):
 def test_what_a_movie_says_of_itself(tmp_path):
     info = Movie(untagged(tmp_path / "a.mkv")).info
     assert (info.width, info.height, info.bits) == (WIDTH, HEIGHT, 8)
-    assert info.pixel_format == "yuv420p"
     assert info.frame_rate == 25
 
 
@@ -250,7 +275,6 @@ def test_odd_sizes_are_decoded_whole(tmp_path):
 def test_what_is_no_movie_is_refused_by_name(content, suffix, tmp_path):
     path = tmp_path / f"take{suffix}"
     path.write_bytes(content)
-    assert not is_movie(path)
     with pytest.raises(InputError, match="take"):
         list(Movie(path).frames())
 
@@ -259,13 +283,14 @@ def test_what_is_no_movie_is_refused_by_name(content, suffix, tmp_path):
 def test_a_still_picture_is_no_movie(suffix, tmp_path):
     path = tmp_path / f"still{suffix}"
     cv2.imwrite(str(path), np.full((HEIGHT, WIDTH, 3), 100, np.uint8))
-    assert not is_movie(path)
+    with pytest.raises(InputError, match="still"):
+        Movie(path)
 
 
-def test_a_movie_is_a_movie(tmp_path):
-    assert is_movie(untagged(tmp_path / "a.mkv"))
-    assert not is_movie(tmp_path / "gone.mkv")
-    assert not is_movie(tmp_path)
+@pytest.mark.parametrize("name", ["gone.mkv", "."])
+def test_what_is_no_file_is_no_movie(name, tmp_path):
+    with pytest.raises(InputError, match=r"no file|neither"):
+        Movie(tmp_path / name)
 
 
 def test_a_truncated_movie_gives_no_broken_frame(tmp_path):
@@ -295,6 +320,5 @@ def test_sound_without_a_picture_is_refused(tmp_path):
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 480), np.int16), layout="mono")
         frame.sample_rate = 48000
         container.mux(stream.encode(frame))
-    assert not is_movie(path)
     with pytest.raises(InputError, match=r"sound\.wav"):
         Movie(path)

@@ -110,6 +110,22 @@ def test_a_slow_sweep_of_a_soft_edge_is_followed(
     assert np.nanpercentile(np.abs(late - early), 90) * speed < 0.15
 
 
+def test_what_a_shadow_passed_unseen_is_unknown(
+    tmp_path: Path, mask: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = shoot(tmp_path / "frames", SWEEPS["first"])
+    scan(frames, tmp_path / "whole", plane=mask)
+    for number in range(1010, 1015):
+        (frames / f"take.{number}.exr").unlink()
+    scan(frames, tmp_path / "holed", plane=mask, run=Run(missing="skip"))
+    assert "no frames between 1009 and 1015" in caplog.text
+    whole, holed = (read_scan(tmp_path / name)[0].times for name in ("whole", "holed"))
+    missed = (whole.time > 1009.5) & (whole.time < 1014.5)
+    assert np.isnan(holed.time[missed]).mean() > 0.99
+    seen = ((whole.time < 1008) | (whole.time > 1016)) & np.isfinite(holed.time)
+    assert np.median(np.abs(holed.time - whole.time)[seen]) < 0.01
+
+
 def test_a_source_that_stands_like_the_target_needs_no_map(
     scans: list[Path], tmp_path: Path
 ) -> None:

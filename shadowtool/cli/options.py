@@ -16,10 +16,20 @@ from shadowtool.cli.report import report
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+
+class _Folder(click.Path):
+    """A folder's name; an empty one, as of a shell's variable that is not set, is none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value == "":
+            self.fail("is empty; name a folder", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 output_option = click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
+    type=_Folder(path_type=Path),
     required=True,
     metavar="DIR",
     help="Folder to write to; made if it isn't there.",
@@ -92,7 +102,7 @@ def folder_option(
     return click.option(
         name,
         parameter,
-        type=click.Path(path_type=Path),
+        type=_Folder(path_type=Path),
         metavar="DIR",
         required=required,
         help=help_text,

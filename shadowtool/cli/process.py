@@ -89,7 +89,9 @@ def run_command(arguments: Sequence[str]) -> int:
     except OSError as error:
         from shadowtool.io.files import translated
 
-        fault = translated(error, Path(str(error.filename or "a file")), "read")
+        # Without a name it is our own output that can't be written.
+        name, verb = (error.filename, "read") if error.filename else ("standard output", "write")
+        fault = translated(error, Path(str(name)), verb)
         _say(str(fault))
         return fault.exit_code
     except MemoryError:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fileseq import findSequencesInList
+from fileseq.constants import PAD_STYLE_HASH1
 from fileseq.exceptions import FileSeqException
 from fileseq.filesequence import FileSequence
 from fileseq.frameset import FrameSet
@@ -180,7 +181,7 @@ def _in_folder(folder: Path, role: str) -> Sequence:
     if not found:
         raise InputError(f"{folder}: holds no EXR or PNG frames for the {role}")
     # One sequence and a still beside it (a reference, a slate) is one sequence.
-    chosen = [sequence for sequence in found if sequence.numbered] or found
+    chosen = [sequence for sequence in found if sequence.digits] or found
     if len(chosen) > 1:
         names = " and ".join(item.sequence.pattern for item in chosen[:2])
         more = f" and {len(chosen) - 2} more" if len(chosen) > 2 else ""
@@ -189,12 +190,12 @@ def _in_folder(folder: Path, role: str) -> Sequence:
 
 
 class _Found(NamedTuple):
-    """A sequence in a folder, and what its files' names are made of."""
+    """A sequence in a folder, and what its files' names are made of: no digits in a still's."""
 
     sequence: Sequence
     base: str
     suffix: str
-    numbered: bool
+    digits: int
 
 
 def _sequences(folder: Path) -> list[_Found]:
@@ -228,13 +229,13 @@ def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
     base, suffix = sequence.basename(), sequence.extension()
     if not frame_set:
         path = folder / str(sequence)
-        return _Found(_single(path), base, suffix, numbered=False)
+        return _Found(_single(path), base, suffix, digits=0)
     frames = sorted(_frames(frame_set))
     files = {frame: folder / sequence.frame(frame) for frame in frames}
-    padding = "#" * max(sequence.zfill(), 1)
+    digits = max(sequence.zfill(), 1)
     name = base.rstrip("._- ") or folder.resolve().name
-    pattern = os.fspath(folder / f"{base}{padding}{suffix}")
-    return _Found(Sequence(name, pattern, files), base, suffix, numbered=True)
+    pattern = os.fspath(folder / f"{base}{'#' * digits}{suffix}")
+    return _Found(Sequence(name, pattern, files), base, suffix, digits)
 
 
 def _single(path: Path) -> Sequence:
@@ -252,18 +253,27 @@ def _of_pattern(path: Path, role: str) -> Sequence:
     if suffix.lower() not in (EXR, PNG):
         raise InputError(f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on it first")
     try:
-        wanted = FileSequence(path.name)
+        # One digit for each #, as we write patterns ourselves.
+        wanted = FileSequence(path.name, pad_style=PAD_STYLE_HASH1)
         base, asked = wanted.basename(), _frames(wanted.frameSet() or ())
         found = [
-            item.sequence
+            item
             for item in _sequences(path.parent)
-            if item.numbered and (item.base, item.suffix) == (base, suffix)
+            if item.digits and (item.base, item.suffix) == (base, suffix)
         ]
     except (FileSeqException, ValueError, OSError):
         found = []
     if not found:
         raise InputError(f"{_short(os.fspath(path))}: no frames for the {role} are there")
-    sequence = found[0]
+    if len(found) > 1:
+        # The number of digits tells sequences apart only where there are several.
+        found = [item for item in found if item.digits == max(wanted.zfill(), 1)]
+    if len(found) != 1:
+        raise InputError(
+            f"{_short(os.fspath(path))}: frames with other numbers of digits are there;"
+            " write as many # as the digits of those that are meant"
+        )
+    sequence = found[0].sequence
     if not asked:
         return sequence
     absent = [frame for frame in asked if frame not in sequence.files]

@@ -16,7 +16,7 @@ from shadowtool.core.compositing import over, shade, shadow_ratio
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.half_floats import to_float, to_half
 from shadowtool.core.warp_map import positions, sample
-from shadowtool.errors import InputError
+from shadowtool.errors import InputError, OptionError
 from shadowtool.io.image import (
     EXR,
     PNG,
@@ -149,7 +149,7 @@ def composite(
 
 def _part(mattes: Path | None, folder: str) -> Path:
     if mattes is None:
-        raise InputError("give the folder of a matte, or --fg and --beta-frames")
+        raise OptionError("give the folder of a matte, or --fg and --beta-frames")
     if not mattes.is_dir():
         raise InputError(f"{mattes}: no such folder for the matte")
     part = mattes / folder

@@ -89,13 +89,14 @@ def matte(
 
     Raises:
         InputError: frames, plates, mattes are missing or don't fit.
+        OptionError: trimaps, given or wanted, beside an alpha.
     """
     footage = open_footage(source, "frames", transfer, run.missing)
     frames, absent = footage.sequence.select(run.frames, run.missing)
     stored = read_plates(plates)
     require_size(plates, stored.header, footage.header, footage.sequence.pattern)
-    if alpha is not None and only == "trimap":
-        raise OptionError("--only trimap makes trimaps, which --alpha replaces; give one of them")
+    if alpha is not None and (trimap is not None or only == "trimap"):
+        raise OptionError("--alpha needs no trimaps; give it without --trimap and --only trimap")
     given = {
         role: open_sequence(path, role)
         for role, path in (("alpha", alpha), ("trimap", trimap))
@@ -148,6 +149,12 @@ def matte(
             "%s: %.0f%% of the picture is taken for the figure; are these the plates of this take?",
             output,
             100 * result.figures["hidden"],
+        )
+    if result.figures.get("unknown", 0) > _TOO_MUCH:
+        logger.warning(
+            "%s: β is unknown in %.0f%% of the picture, where the plates know no shadow",
+            output,
+            100 * result.figures["unknown"],
         )
     return result
 

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,8 +16,22 @@ from shadowtool.steps.footage import require_size
 _POINT = re.compile(r"-?\d+(?:\.\d+)?,-?\d+(?:\.\d+)?")
 
 
-def read_plane(plane: str, header: Header) -> tuple[NDArray[np.bool_], str]:
-    """The reference plane region (H, W) and a fingerprint of it.
+class Plane(NamedTuple):
+    """The reference plane region.
+
+    Attributes:
+        region: (H, W) bool, where it is.
+        name: what a person would call it: the polygon, or the mask's file.
+        mark: a fingerprint of it.
+    """
+
+    region: NDArray[np.bool_]
+    name: str
+    mark: str
+
+
+def read_plane(plane: str, header: Header) -> Plane:
+    """The reference plane region.
 
     Raises:
         InputError: no such mask, or of another size.
@@ -30,14 +45,14 @@ def read_plane(plane: str, header: Header) -> tuple[NDArray[np.bool_], str]:
         region = np.zeros((header.height, header.width), np.uint8)
         corners = np.rint(np.clip(points, -1e6, 1e6)).astype(np.int32)
         cv2.fillPoly(region, [corners], 255)
-        name = " ".join(words)
+        name = mark = " ".join(words)
     elif not words or (re.fullmatch(r"[-\d.,\s]+", plane) and not is_file(Path(plane))):
         raise OptionError(f"--plane {plane!r}: neither a mask image nor a polygon x,y x,y x,y ...")
     else:
         image = read_image(Path(plane))
         require_size(image.path, image.header, header, "the footage")
         region = (image.plane("A", "Y", "G") > 0.5).astype(np.uint8)
-        name = image.fingerprint
+        name, mark = image.path.name, image.fingerprint
     if not region.any():
         raise OptionError(f"--plane {plane}: no pixel of the picture lies inside")
-    return region > 0, name
+    return Plane(region > 0, name, mark)

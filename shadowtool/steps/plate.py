@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,7 +34,7 @@ from shadowtool.core.robust_plates import (
     hide,
     keyed,
 )
-from shadowtool.errors import DamagedFileError, InputError
+from shadowtool.errors import DamagedFileError, InputError, OptionError
 from shadowtool.io.files import fingerprint_file, is_file, make_folder, new_folders
 from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, plate_files, plate_layers
@@ -47,6 +48,7 @@ from shadowtool.steps.run import (
     Result,
     Run,
     refuse_existing,
+    refuse_other_step,
     unchanged,
     write_manifest,
 )
@@ -88,6 +90,7 @@ def plate(
 
     Raises:
         InputError: frames, holdout or mask are missing or don't fit.
+        OptionError: a plane for ``minmax``, or a polygon that can't be read.
         DamagedFileError: a frame can't be read.
     """
     footage = open_footage(source, "frames", transfer, run.missing)
@@ -98,30 +101,44 @@ def plate(
         if holdout in ("auto", "none")
         else _open_holdout(holdout, frames, footage, run.missing)
     )
-    region, plane_mark = (None, "") if plane is None else read_plane(plane, footage.header)
+    if plane is not None and estimator == "minmax":
+        raise OptionError("--plane is for --estimator robust; Eq. (4) knows no plane")
+    marked = None if plane is None else read_plane(plane, footage.header)
 
     written = [_place(output / HOLDOUT_FOLDER, frame) for frame in frames] if automatic else []
     refuse_existing([*plate_files(output), output / MANIFEST, *written], run)
+    refuse_other_step("plate", output, run)
     inputs = {"frames": Path(footage.sequence.pattern).name}
+    shared = list[str]()
+    if marked is not None:
+        inputs["--plane"] = marked.name
+        shared = [marked.mark]
     parameters = {
         "estimator": estimator,
         "transfer": footage.transfer,
-        "plane": plane_mark or None,
         "gain": gain if estimator == "robust" else "none",
         "holdout": Path(held.pattern).name if held is not None else str(holdout),
     }
     recipe = Recipe("plate", parameters, inputs)
     if run.resume:
-        paths = [footage.sequence.path(f) for f in frames]
-        marks = list(ordered_map(fingerprint_file, paths, run.jobs))
-        if held is not None:
-            given = ordered_map(fingerprint_file, [held.path(f) for f in frames], run.jobs)
-            marks = [mark for pair in zip(marks, given, strict=True) for mark in pair]
-        mark = recipe.fingerprint(marks)
+
+        def fingerprints(frame: Frame) -> list[str]:
+            try:
+                read = [sequence.path(frame) for sequence in (footage.sequence, held) if sequence]
+                return [fingerprint_file(path) for path in read]
+            except InputError:
+                if run.missing == "skip":
+                    return []
+                raise
+
+        known = dict(zip(frames, ordered_map(fingerprints, frames, run.jobs), strict=True))
+        mark = recipe.fingerprint([*shared, *chain.from_iterable(known.values())])
         figures = unchanged(output, plate_files(output), mark)
         kept = written if figures and figures.get("held_out") == HOLDOUT_FOLDER else []
         if figures is not None and all(is_file(file) for file in kept):
-            return Result("plate", output, frames, len(frames), absent, figures)
+            used = [frame for frame in frames if known[frame]]
+            skipped = [*absent, *(frame for frame in frames if not known[frame])]
+            return Result("plate", output, used, len(used), skipped, figures)
     take = _Take(
         footage,
         run,
@@ -134,6 +151,7 @@ def plate(
         if estimator == "minmax":
             estimate = _extremes(take, frames, automatic)
         else:
+            region = None if marked is None else marked.region
             estimate = _robust(take, frames, automatic, region)
     if len(take.used) < 2:
         logger.warning("%s: one frame shows no moving shadow", footage.sequence.pattern)
@@ -145,7 +163,7 @@ def plate(
     if unseen:
         part = 100 * unseen / pixels
         logger.warning("%s: %d pixels (%.2f%%) were seen in no frame", output, unseen, part)
-    mark = recipe.fingerprint(take.marks)
+    mark = recipe.fingerprint([*shared, *take.marks])
     provenance = recipe.provenance(mark)
     figures = {
         "frames": len(take.used),
@@ -170,6 +188,8 @@ def plate(
 
     for _ in ordered_map(write, products(), run.jobs):
         pass
+    if figures.get("shaded") == 0:
+        logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
     write_manifest(output, recipe, mark, figures)
     return Result("plate", output, take.used, 0, [*absent, *take.skipped], figures)
 
@@ -456,12 +476,13 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         shadow = shortened(completed.shadow)
         plates = Plates(lit, shadow, found.lit_frames, found.shadow_frames)
         seen = found.lit_frames > 0
+        shaded = found.shadow_frames > 0
         reading = "a plane that a shadow crossed" if completed.partial else "a scene under a card"
         figures: Figures = {
             "gains": take.gains,
-            "shaded": round(float((found.shadow_frames > 0).mean()), 4),
+            "shaded": round(float(shaded.mean()), 4),
             "own_evidence": round(float(completed.own[seen].mean()), 4) if seen.any() else 0.0,
-            "read_as": reading,
+            "read_as": reading if shaded.any() else "a scene without shadow",
         }
         return plates, figures
 

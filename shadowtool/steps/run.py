@@ -11,7 +11,7 @@ from typing import Any
 
 from shadowtool import __version__
 from shadowtool.choices import Missing
-from shadowtool.errors import DamagedFileError, InputError, OutputExistsError
+from shadowtool.errors import InputError, OptionError, OutputExistsError
 from shadowtool.io.files import fingerprinted, is_file, new_folders
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
@@ -56,8 +56,8 @@ class Recipe:
     Attributes:
         step: the step's name.
         parameters: values that JSON can hold; no paths, no number of jobs.
-        inputs: what was read, as a person would name it, by option, or by a word of its own for
-            an argument.
+        inputs: what was read, as a person would name it, by option (numbered, ``--scan 2``, if it
+            is given more than once), or by a word of its own for an argument.
     """
 
     step: str
@@ -69,11 +69,11 @@ class Recipe:
         """How to run the step again, but for -o: names without their folders."""
         words = ["shadowtool", self.step]
         for name, value in self.inputs.items():
-            words += [name, value] if name.startswith("--") else [value]
+            words += [name.split()[0], value] if name.startswith("--") else [value]
         for name, value in self.parameters.items():
-            if value is True:
-                words.append(f"--{name}")
-            elif isinstance(value, (str, int, float)) and not isinstance(value, bool):
+            if isinstance(value, bool):
+                words.append(f"--{name}" if value else f"--no-{name}")
+            elif isinstance(value, (str, int, float)):
                 words += [f"--{name}", str(value)]
         return shlex.join(words)
 
@@ -123,6 +123,19 @@ def refuse_existing(files: Iterable[Path], run: Run) -> None:
         )
 
 
+def refuse_other_step(step: str, output: Path, run: Run) -> None:
+    """Stop before another step's record is replaced.
+
+    Raises:
+        OutputExistsError: the folder holds one, and overwriting is not wanted.
+    """
+    other = read_record(output / MANIFEST).get("step", step)
+    if other != step and not run.overwrite:
+        raise OutputExistsError(
+            f"{output / MANIFEST}: is the record of {other}; give another folder"
+        )
+
+
 @dataclass(frozen=True)
 class FrameWork:
     """One step's work on single frames.
@@ -157,11 +170,8 @@ class FrameWork:
             summary: from the figures of all the frames that the manifest knows.
         """
         refuse_existing((file for frame in frames for file in self.products(frame)), run)
-        other = read_record(self.output / MANIFEST).get("step", self.recipe.step)
-        if other != self.recipe.step and not run.overwrite:
-            raise OutputExistsError(
-                f"{self.output / MANIFEST}: is the record of {other}; give another folder"
-            )
+        refuse_other_step(self.recipe.step, self.output, run)
+        self._refuse_inputs(frames)
         folders = {file.parent for frame in frames for file in self.products(frame)}
         rows: dict[str, Figures] = {}
         skipped, kept = list(absent), 0
@@ -182,6 +192,19 @@ class FrameWork:
         done = [frame for frame in frames if str(frame) in rows]
         return Result(self.recipe.step, self.output, done, kept, skipped, figures)
 
+    def _refuse_inputs(self, frames: Sequence[Frame]) -> None:
+        """Stop before a step writes over what it reads."""
+        for frame in frames:
+            try:
+                sources = {file.name: file for file in self.sources(frame)}
+            except InputError:
+                # Said, or skipped, in the frame's turn.
+                continue
+            for file in self.products(frame):
+                source = sources.get(file.name)
+                if source is not None and is_file(file) and file.samefile(source):
+                    raise OptionError(f"{file}: is a frame to be read; give another -o")
+
     def _frame(self, frame: Frame, run: Run) -> tuple[Figures, bool] | None:
         try:
             with fingerprinted(self.sources(frame)) as inputs:
@@ -189,7 +212,7 @@ class FrameWork:
                 if run.resume and (figures := current(self.products(frame), mark)) is not None:
                     return {"fingerprint": mark, **figures}, True
                 figures = self.make(frame, self.recipe.provenance(mark))
-        except (DamagedFileError, InputError):
+        except InputError:
             if run.missing == "skip":
                 return None
             raise

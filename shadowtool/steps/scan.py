@@ -49,6 +49,7 @@ from shadowtool.steps.run import (
     Result,
     Run,
     refuse_existing,
+    refuse_other_step,
     unchanged,
     write_manifest,
 )
@@ -62,10 +63,14 @@ PICTURE = "scan.png"
 
 # Bends of more pixels than this, that are so many standard deviations, come from a lens.
 _BENT, _CERTAIN = 1.0, 6.0
+# Single floats tell frames of higher numbers into less than a sixteenth.
+_FEW_DIGITS = 2**20
 # A sweep reaches little of the frame, and is fast: a part of the frame, pixels a frame.
 _LITTLE, _FAST = 0.5, 20.0
 # Times differ by so many times what noise explains only if something is wrong.
 _TREMBLING = 2.0
+# Between frames so many times further apart than usual the shadow passes more than can be told.
+_HOLE = 3.0
 # If more of the frame than this can't be told from one reading, the frames are read again.
 _LOST = 0.05
 
@@ -95,14 +100,15 @@ def scan(
     frames, absent = footage.sequence.select(run.frames, run.missing)
     if len(frames) < 3:
         raise InputError(f"{footage.sequence.pattern}: {len(frames)} frames make no sweep")
-    region, plane_mark = read_plane(plane, footage.header)
+    region, plane_name, plane_mark = read_plane(plane, footage.header)
     products = [output / SCAN, output / LINES, output / PICTURE]
     refuse_existing([*products, output / MANIFEST], run)
     recipe = Recipe(
         "scan",
         {"gain": gain, "transfer": footage.transfer},
-        {"frames": Path(footage.sequence.pattern).name, "--plane": plane_mark},
+        {"frames": Path(footage.sequence.pattern).name, "--plane": plane_name},
     )
+    refuse_other_step("scan", output, run)
     if run.resume:
         paths = [footage.sequence.path(frame) for frame in frames]
         mark = recipe.fingerprint([plane_mark, *ordered_map(fingerprint_file, paths, run.jobs)])
@@ -113,12 +119,19 @@ def scan(
     used = list(gains)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
     numbers = np.array([float(frame) for frame in used])
-    if numbers[-1] > 2**20:
+    if numbers[-1] > _FEW_DIGITS:
         logger.warning(
             "%s: frame numbers this large leave float32 times few digits; renumber the take",
             footage.sequence.pattern,
         )
     times, raised = _times(crossings, noise, region, numbers, run.jobs)
+    for before in np.flatnonzero(_holes(numbers)):
+        logger.warning(
+            "%s: no frames between %s and %s; what the shadow passed meanwhile is unknown",
+            footage.sequence.pattern,
+            used[before],
+            used[before + 1],
+        )
     points = zero_crossings(times.time, region, numbers)
     try:
         lines = fit_shadow_lines(points, numbers)
@@ -248,6 +261,8 @@ def _times(
     in_shade = loss < SHADE
     own[in_shade], own_error[in_shade] = np.nan, np.inf
     own_error /= np.maximum(loss, SHADE) ** 2
+    in_hole = np.append(False, _holes(numbers))[crossings.at]
+    own[in_hole], own_error[in_hole] = np.nan, np.inf
     time, error = np.empty_like(own), np.empty_like(own_error)
     windows = time_windows(own, region)
     raised = understated(own, own_error, region, windows)
@@ -265,7 +280,16 @@ def _times(
         spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))
         error, own_error = ((e * spacing).astype(np.float32) for e in (error, own_error))
     time, own = _numbers(time, numbers), _numbers(own, numbers)
+    if numbers[-1] > _FEW_DIGITS:
+        step = np.float32(np.spacing(np.float32(numbers[-1])) / np.sqrt(12))
+        error, own_error = np.hypot(error, step), np.hypot(own_error, step)
     return ShadowTimes(time, error, contrast, own, own_error), raised
+
+
+def _holes(numbers: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """After which of the frames but the last too many are missing."""
+    steps = np.diff(numbers)
+    return np.asarray(steps > _HOLE * np.median(steps), bool)
 
 
 def _numbers(clock: Float32, numbers: NDArray[np.float64]) -> Float32:

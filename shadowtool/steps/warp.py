@@ -34,6 +34,7 @@ from shadowtool.steps.run import (
     Result,
     Run,
     refuse_existing,
+    refuse_other_step,
     unchanged,
     write_manifest,
 )
@@ -90,6 +91,8 @@ def warp(
         raise OptionError("a map takes two scans or more, swept at different angles")
     if source_scans and map_file is not None:
         raise OptionError("--source-scan goes with SCAN folders, not with --map")
+    if not math.isfinite(outside):
+        raise OptionError(f"--outside {outside}: must be a number")
     if source_scans and len(source_scans) < 2:
         raise OptionError("give --source-scan twice or more, for sweeps at different angles")
     applied = None if apply_to is None else _open_frames(apply_to, output, run)
@@ -167,9 +170,10 @@ def _solve(
     inputs = {f"scan {i}": name for i, name in enumerate(target.names, start=1)}
     marks = list(target.marks)
     if source is not None:
-        inputs |= {f"source scan {i}": name for i, name in enumerate(source.names, start=1)}
+        inputs |= {f"--source-scan {i}": name for i, name in enumerate(source.names, start=1)}
         marks += ["source", *source.marks]
     recipe = Recipe("warp", {"iterations": iterations}, inputs)
+    refuse_other_step("warp", output, run)
     mark = recipe.fingerprint(marks)
     if run.resume:
         figures = unchanged(output, [output / WARP, output / PICTURE], mark)

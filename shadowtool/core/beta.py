@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Beta, Fill
-from shadowtool.core.bands import bands, in_all_channels, overlapping_bands
+from shadowtool.core.bands import bands, channel_sum, in_all_channels, overlapping_bands
 from shadowtool.core.boxes import Box, around
 from shadowtool.core.exposure import without_gain
 from shadowtool.core.filling import fill_membrane
@@ -25,7 +25,7 @@ _LARGEST_HOLE = 0.005
 # Below this many standard deviations between L and S, β would be off by more than 0.1.
 _LEAST_CONTRAST = 10.0
 _WINDOW = 5
-_ONES, _BOX = np.ones((1, 3), np.float32), np.ones(_WINDOW, np.float32)
+_BOX = np.ones(_WINDOW, np.float32)
 # What is unknown is continued from what is this near, pixels.
 _RING = 2
 # So many pixels at a time stay in the processor's cache with all that is made of them.
@@ -53,7 +53,7 @@ def inverse_span(lit: Float32, shadow: Float32, beta: Beta = "scalar") -> Float3
             if beta == "rgb":
                 np.divide(1, span, out=inverse[rows])
             else:
-                np.divide(span, in_all_channels(_sum(span * span)), out=inverse[rows])
+                np.divide(span, in_all_channels(channel_sum(span * span)), out=inverse[rows])
             inverse[rows][~np.isfinite(inverse[rows])] = np.nan
     return inverse
 
@@ -80,13 +80,8 @@ def shadow_matte(
                 cv2.subtract(image[rows], shadow[rows], dtype=cv2.CV_32F), np.float32
             )
             above *= inverse[rows]
-            result[rows] = _sum(above) if beta == "scalar" else above
+            result[rows] = channel_sum(above) if beta == "scalar" else above
     return result
-
-
-def _sum(image: Float32) -> Float32:
-    """The sum of three channels, (H, W)."""
-    return np.asarray(cv2.transform(image, _ONES), np.float32)
 
 
 def channel_contrast(plates: Plates, noise: NoiseModel) -> Float32:
@@ -110,9 +105,9 @@ def shadow_contrast(plates: Plates, noise: NoiseModel) -> Float32:
             lit, shadow = plates.lit[rows], plates.shadow[rows]
             span = lit - shadow
             span *= span
-            length = _sum(span)
+            length = channel_sum(span)
             span *= noise.variance((lit + shadow) / 2)
-            np.divide(length, np.sqrt(_sum(span)), out=contrast[rows])
+            np.divide(length, np.sqrt(channel_sum(span)), out=contrast[rows])
             contrast[rows][length == 0] = 0
     return contrast
 

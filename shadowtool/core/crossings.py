@@ -115,17 +115,22 @@ class CrossingFinder:
         self._frames = 0
         self._holes = False
 
-    def add(self, gray: NDArray[np.floating]) -> None:
+    def add(self, gray: NDArray[np.floating]) -> int:
         """Take in one frame's luminance, (H, W), in the order of the pass.
 
         Where it is not finite, or too large for a half, the last value that was stands.
+
+        Returns:
+            In how many pixels that is so.
         """
         halfs = np.ascontiguousarray(rounded(gray)).ravel()
-        keys = halfs.view(np.int16)
+        keys, not_finite = halfs.view(np.int16), 0
         # Neither negative nor infinite nor NaN: bits are keys.
         if halfs.view(np.uint16).max() >= _INFINITE:
             last = self._last() if self._frames else np.full_like(keys, _UNKNOWN)
-            keys = np.where(np.isfinite(halfs), to_keys(halfs), last)
+            finite = np.isfinite(halfs)
+            not_finite = finite.size - int(np.count_nonzero(finite))
+            keys = np.where(finite, to_keys(halfs), last)
             self._holes = self._holes or bool((keys == _UNKNOWN).any())
         if self._frames:
             self._waiting.append(keys)
@@ -135,6 +140,7 @@ class CrossingFinder:
         else:
             self._shape = gray.shape
             self._begin(keys)
+        return not_finite
 
     def found(self) -> Crossings:
         """What was found; the end of the pass.

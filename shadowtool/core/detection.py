@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.backdrop import Backdrop, Nearest, Places
+from shadowtool.core.bands import channel_sum
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.trimap import BACKGROUND, FIGURE
 
@@ -163,9 +164,9 @@ def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:
     Above 0 the ground's texture is hidden, below 0 it shows, 0 if it has none. Each pixel has half
     of what the steps around it say.
     """
-    value = np.maximum(_sum(image), np.float32(1e-3))
+    value = np.maximum(channel_sum(image), np.float32(1e-3))
     seen = np.log(value)
-    known = np.log(np.maximum(_sum(backdrop.lit), np.float32(1e-3)))
+    known = np.log(np.maximum(channel_sum(backdrop.lit), np.float32(1e-3)))
     noise = backdrop.noise
     slope, floor = np.float32(noise.slope.mean()), np.float32(noise.floor.sum())
     variance = (slope * value + floor) / value**2 + np.float32(_LEAST_TEXTURE**2)
@@ -196,11 +197,6 @@ def _leaning(hint: UInt8) -> Float32:
     )
     between = (background - figure) / (2 * (background + figure))
     return np.asarray(np.where(sure == 0, between, sure), np.float32)
-
-
-def _sum(image: Float32) -> Float32:
-    """Of the channels."""
-    return np.asarray(image[..., 0] + image[..., 1] + image[..., 2], np.float32)
 
 
 def _background_error(nearest: Nearest, mask: Bool) -> Float32:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.bands import bands
+from shadowtool.core.bands import bands, channel_sum
 from shadowtool.core.half_floats import rounded, to_float
 
 Float32 = NDArray[np.float32]
@@ -35,7 +35,7 @@ def frame_gain(image: Float32, reference: Float32) -> float:
     Returns:
         The most frequent ratio of the two; 1 if it is next to 1, or nothing agrees.
     """
-    centre = _agreed(_ratios(_sum(image), _sum(reference)))
+    centre = _agreed(_ratios(channel_sum(image), channel_sum(reference)))
     return 1.0 if centre is None or abs(centre) < _NOTHING else float(np.exp(centre))
 
 
@@ -123,11 +123,6 @@ class RunningGain:
     def _gain(self) -> float:
         steady = abs(self._logarithm) < _HARMLESS
         return 1.0 if steady else float(np.exp(self._logarithm))
-
-
-def _sum(image: Float32) -> Float32:
-    """Of the channels, (h, w); several times faster than along so short an axis."""
-    return np.asarray(image[..., 0] + image[..., 1] + image[..., 2], np.float32)
 
 
 def common_reference(samples: list[Float32]) -> Float32:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import channel_sum
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.noise import NoiseModel
 
@@ -53,7 +54,7 @@ def shadow_ratio_field(
     Returns:
         (H, W, 3) float32 and the spread of log ratios; None if nothing was shaded in full.
     """
-    gray = _log_ratio(_sum(lit), _sum(shadow))
+    gray = _log_ratio(channel_sum(lit), channel_sum(shadow))
     return _ratio_field(lit, shadow, gray, _level(gray, frames), plane)
 
 
@@ -122,21 +123,21 @@ def complete_shadow(
         plane: (H, W) the region of the plane, if it is known: the second reading holds there, the
             first elsewhere.
     """
-    seen, dark = np.isfinite(_sum(lit)), np.isfinite(_sum(shadow))
+    seen, dark = np.isfinite(channel_sum(lit)), np.isfinite(channel_sum(shadow))
     if plane is None:
         firm = (frames >= _FIRM) & seen
         partial = bool(firm.sum() < _MOST * max(int(seen.sum()), 1))
         region = np.full(dark.shape, partial)
     else:
         partial, region = True, plane
-    gray = _log_ratio(_sum(lit), _sum(shadow))
+    gray = _log_ratio(channel_sum(lit), channel_sum(shadow))
     level = _level(gray, frames)
     found = _ratio_field(lit, shadow, gray, level, plane)
     result = np.asarray(cv2.copyTo(shadow, dark.view(np.uint8), lit.copy()), np.float32)
     if found is None:
         return Completed(result, np.asarray(dark, np.float32), partial=False)
     expected, spread = found
-    gray -= np.log(_sum(expected) / 3)
+    gray -= np.log(channel_sum(expected) / 3)
     with np.errstate(invalid="ignore"):
         darker, alike = gray <= -_ALIKE * spread, np.abs(gray) < _ALIKE * spread
     expected *= lit
@@ -159,11 +160,6 @@ def complete_shadow(
     nothing = (own == 0) & (dark | region)
     cv2.copyTo(expected, nothing.view(np.uint8), result)
     return Completed(result, own, partial)
-
-
-def _sum(plate: Float32) -> Float32:
-    """Of the channels, (H, W); NaN where one is."""
-    return np.asarray(cv2.transform(plate, np.ones((1, 3), np.float32)), np.float32)
 
 
 def _opened(mask: Bool) -> Bool:

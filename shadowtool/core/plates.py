@@ -54,8 +54,8 @@ class ExtremePlates:
         # In how many of them each pixel was not seen; None while all were in all.
         self._missed: NDArray[np.uint32] | None = None
 
-    def add(self, image: NDArray[np.floating], holdout: NDArray[np.number] | None = None) -> None:
-        """Take one frame in.
+    def add(self, image: NDArray[np.floating], holdout: NDArray[np.number] | None = None) -> int:
+        """Take one frame in; returns how many of its pixels are not finite.
 
         Args:
             image: (H, W, 3) float16 or float32, linear light, the same size in every call. A
@@ -79,10 +79,12 @@ class ExtremePlates:
             # Halfs and floats in one take: go on in float, which holds every half.
             self._lowest, self._highest = _values(self._lowest), _values(self._highest)
         self._frames += 1
+        not_finite = 0
         for rows in bands(image.shape):
             keys, out = _order_keys(image[rows])
             keys = _values(keys) if mixed else keys
             lowest, highest = self._lowest[rows], self._highest[rows]
+            not_finite += 0 if out is None else int(np.count_nonzero(out))
             if holdout is not None:
                 # NaN in a matte says nothing in favour of the pixel.
                 held = np.asarray(~(holdout[rows] <= 0))
@@ -97,6 +99,7 @@ class ExtremePlates:
                 if self._missed is None:
                     self._missed = np.zeros(image.shape[:2], np.uint32)
                 self._missed[rows] += out
+        return not_finite
 
     def plates(self) -> Plates:
         """The plates so far.

@@ -59,11 +59,13 @@ class Keyed(NamedTuple):
         keys: (H, W, 3) int16, the channels.
         gray: (H, W) int16, one key a pixel; those that are not seen are marked by `hide`.
         signed: whether a key may be negative.
+        not_finite: how many pixels have a channel that is NaN or infinite.
     """
 
     keys: Int16
     gray: Int16
     signed: bool
+    not_finite: int
 
 
 def keyed(image: NDArray[np.floating], holdout: NDArray[np.number] | None = None) -> Keyed:
@@ -75,7 +77,7 @@ def keyed(image: NDArray[np.floating], holdout: NDArray[np.number] | None = None
     halfs = np.ascontiguousarray(halfs, np.float16)
     keys = halfs.view(np.int16)
     gray = np.empty(keys.shape[:2], np.int16)
-    signed = False
+    signed, not_finite = False, 0
     for start in range(0, len(keys), _ROWS):
         rows = slice(start, start + _ROWS)
         own = finite_keys(halfs[rows])
@@ -86,10 +88,11 @@ def keyed(image: NDArray[np.floating], holdout: NDArray[np.number] | None = None
         gray_keys(own.keys, own.signed, gray[rows])
         if own.bad is not None:
             hide(gray[rows], own.bad)
+            not_finite += int(np.count_nonzero(own.bad))
     if holdout is not None:
         # NaN in a matte says nothing in favour of the pixel.
         hide(gray, np.asarray(~(holdout <= 0)))
-    return Keyed(keys, gray, signed)
+    return Keyed(keys, gray, signed, not_finite)
 
 
 def hide(gray: Int16, where: Bool) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Format
 from shadowtool.core import camera_motion
+from shadowtool.core.half_floats import not_finite
 from shadowtool.core.noise import NoiseSamples, noise_levels
 from shadowtool.core.shadow_time import luminance
 from shadowtool.core.transfer import TRANSFERS
@@ -37,6 +38,7 @@ from shadowtool.steps.run import (
     current,
     refuse_existing,
     refuse_other_step,
+    warn_of_nan,
     write_manifest,
 )
 
@@ -160,6 +162,7 @@ def capture(
     record = _record(opened, report, frames, transfer, size)
     write_json(output / RECORD, record)
     _warn(record, output)
+    warn_of_nan(output, report.not_finite)
     motion = record["camera_motion"]
     if strict:
         _require_still(opened.name, motion)
@@ -183,6 +186,7 @@ class _Measured(NamedTuple):
     linear: Float32
     shift: float | None
     clipped: float
+    not_finite: int
     kept: bool
 
 
@@ -196,6 +200,7 @@ class _Report:
     seconds: list[tuple[Frame, float]] = field(default_factory=list)
     clipped: list[float] = field(default_factory=list)
     marks: dict[str, str] = field(default_factory=dict)
+    not_finite: dict[str, int] = field(default_factory=dict)
     kept: int = 0
     before: Float32 | None = None
 
@@ -208,6 +213,7 @@ class _Report:
         self.before = grid
         self.shifts[str(frame)] = measured.shift
         self.clipped.append(measured.clipped)
+        self.not_finite[str(frame)] = measured.not_finite
         self.kept += measured.kept
         if seconds is not None:
             self.seconds.append((frame, seconds))
@@ -302,7 +308,9 @@ class _Taking:
         shift = None if reference is None else camera_motion.shift(reference, gray, self.size[0])
         top = _LARGEST_HALF if self.source.bits is None else _CLIPPED_CODE
         clipped = float((loaded.values >= top).any(axis=-1).mean())
-        return _Measured(arriving, linear, shift, clipped, kept)
+        bad = not_finite(linear)
+        count = 0 if bad is None else int(np.count_nonzero(bad))
+        return _Measured(arriving, linear, shift, clipped, count, kept)
 
     @staticmethod
     def _prepared(linear: Float32) -> Float32:

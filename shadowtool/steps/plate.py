@@ -50,6 +50,7 @@ from shadowtool.steps.run import (
     refuse_existing,
     refuse_other_step,
     unchanged,
+    warn_of_nan,
     write_manifest,
 )
 
@@ -160,6 +161,7 @@ def plate(
     pixels = estimate.lit.shape[0] * estimate.lit.shape[1]
     if unseen == pixels:
         raise InputError(_nothing_seen(take))
+    warn_of_nan(output, take.not_finite)
     if unseen:
         part = 100 * unseen / pixels
         logger.warning("%s: %d pixels (%.2f%%) were seen in no frame", output, unseen, part)
@@ -249,6 +251,7 @@ class _Take:
         known_gains: of the sampled frames.
         masks: their automatic holdouts on the grid, once they are known.
         gains: of the frames that were used, where they are not 1.
+        not_finite: how many of their pixels are NaN or infinite.
         folder: where the automatic one is written.
     """
 
@@ -264,6 +267,7 @@ class _Take:
     known_gains: dict[Frame, float] = field(default_factory=dict)
     masks: dict[Frame, Bool] = field(default_factory=dict)
     gains: dict[str, float] = field(default_factory=dict)
+    not_finite: dict[str, int] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
     marks: list[str] = field(default_factory=list)
@@ -451,7 +455,7 @@ def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
     thinned: dict[int, NDArray[np.float32]] = {}
     extremes = ExtremePlates()
     for position, item in take.all_shown(frames, with_keys=False, begun=begun):
-        extremes.add(item.values, item.holdout)
+        take.not_finite[str(frames[position])] = extremes.add(item.values, item.holdout)
         if position in numbers:
             thinned[numbers[position]] = thin(item.values)
     plates = extremes.plates()
@@ -464,8 +468,9 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
     estimate = RobustPlates(levels, noise)
     # What has been looked up in them is larger than they are.
     del levels
-    for _, item in take.all_shown(frames, with_keys=True, begun=begun):
+    for position, item in take.all_shown(frames, with_keys=True, begun=begun):
         assert item.keys is not None
+        take.not_finite[str(frames[position])] = item.keys.not_finite
         estimate.add(item.keys)
     found = estimate.measured()
     del estimate

@@ -187,7 +187,7 @@ class FrameWork:
                 run.progress(number, len(frames))
             if not rows:
                 raise InputError(f"{self.output}: no frame could be made; all are skipped")
-        _warn_of_nan(self.output, rows)
+        warn_of_nan(self.output, {frame: row.get("not_finite", 0) for frame, row in rows.items()})
         figures = self._record(rows, summary)
         done = [frame for frame in frames if str(frame) in rows]
         return Result(self.recipe.step, self.output, done, kept, skipped, figures)
@@ -235,8 +235,9 @@ class FrameWork:
         return figures
 
 
-def _warn_of_nan(output: Path, rows: Mapping[str, Figures]) -> None:
-    found = {frame: row["not_finite"] for frame, row in rows.items() if row.get("not_finite")}
+def warn_of_nan(output: Path, counts: Mapping[str, int]) -> None:
+    """Name the frames in which so many pixels, if any, are not finite."""
+    found = {frame: count for frame, count in counts.items() if count}
     if found:
         named = ", ".join(f"{frame} ({count})" for frame, count in list(found.items())[:10])
         more = f" and {len(found) - 10} more" if len(found) > 10 else ""

@@ -51,6 +51,7 @@ from shadowtool.steps.run import (
     refuse_existing,
     refuse_other_step,
     unchanged,
+    warn_of_nan,
     write_manifest,
 )
 
@@ -115,7 +116,8 @@ def scan(
         figures = unchanged(output, products, mark)
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
-    crossings, noise, marks, gains, first = _crossings(footage, frames, gain, run)
+    crossings, noise, marks, gains, bad, first = _crossings(footage, frames, gain, run)
+    warn_of_nan(output, bad)
     used = list(gains)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
     numbers = np.array([float(frame) for frame in used])
@@ -167,6 +169,7 @@ class _Reading(NamedTuple):
     Attributes:
         marks: the content of its files.
         gains: of the frames that could be read.
+        not_finite: how many pixels of frames are NaN or infinite.
         first: the first frame, if it could be read, to be looked at.
     """
 
@@ -174,6 +177,7 @@ class _Reading(NamedTuple):
     noise: NoiseModel
     marks: list[str]
     gains: dict[Frame, float]
+    not_finite: dict[str, int]
     first: UInt8 | None
 
 
@@ -204,7 +208,7 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
         return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
 
     finder, exposure = CrossingFinder(), RunningGain()
-    marks, gains = list[str](), dict[Frame, float]()
+    marks, gains, bad = list[str](), dict[Frame, float](), dict[str, int]()
     thinned: dict[int, Float32] = {}
     first: UInt8 | None = None
     run.progress(0, len(frames))
@@ -213,7 +217,7 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
             gray, areas, sample, picture, mark = item
             first = first if picture is None else picture
             own = exposure.add(areas) if gain == "auto" else 1.0
-            finder.add(without_gain(gray, own))
+            bad[str(frames[position])] = finder.add(without_gain(gray, own))
             marks.append(mark)
             gains[frames[position]] = own
             if sample is not None:
@@ -226,7 +230,7 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
     crossings = significant(finder.found(), noise)
     if crossings.lost.mean() > _LOST:
         crossings = _looked_at_again(footage, crossings, gains, run)
-    return _Reading(crossings, noise, marks, gains, first)
+    return _Reading(crossings, noise, marks, gains, bad, first)
 
 
 def _looked_at_again(

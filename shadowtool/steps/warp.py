@@ -10,7 +10,7 @@ import numpy as np
 from shadowtool.core.bands import bands, in_all_channels
 from shadowtool.core.diffusion import diffuse
 from shadowtool.core.epipole import Epipole
-from shadowtool.core.half_floats import to_float, to_half
+from shadowtool.core.half_floats import all_finite, to_float, to_half
 from shadowtool.core.inverse_map import compose, invert
 from shadowtool.core.pictures import warp_picture
 from shadowtool.core.warp_map import (
@@ -23,7 +23,16 @@ from shadowtool.core.warp_map import (
 )
 from shadowtool.errors import OptionError, ReshootError
 from shadowtool.io.files import is_file, make_folder
-from shadowtool.io.image import EXR, Header, Image, read_header, read_image, write_exr, write_png
+from shadowtool.io.image import (
+    EXR,
+    Header,
+    Image,
+    decode,
+    read_header,
+    read_image,
+    write_exr,
+    write_png,
+)
 from shadowtool.io.products import MANIFEST, WARP, read_scan, read_warp, write_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_size
@@ -36,6 +45,7 @@ from shadowtool.steps.run import (
     refuse_existing,
     refuse_other_step,
     unchanged,
+    with_figures,
     write_manifest,
 )
 from shadowtool.steps.solve import solve
@@ -250,18 +260,27 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
         layers = {}
         for name, values in image.layers.items():
             edge = 0.0 if name == "confidence" else outside
-            plain = image.rgb("none") if values.dtype.kind == "u" and values.ndim == 3 else values
-            single = image.plane(name) if values.ndim == 2 else plain
+            single = decode(values, "none")
             layers[name] = _warped(single, scaled, edge, values.dtype == np.float32)
-        quick = _has_grain(image)
-        write_exr(products(frame)[0], layers, image.header, provenance, quick)
-        return {}
+        figures = {"not_finite": _not_finite(image)}
+        marked, quick = with_figures(provenance, figures), _has_grain(image)
+        write_exr(products(frame)[0], layers, image.header, marked, quick)
+        return figures
 
     def sources(frame: Frame) -> list[Path]:
         return [sequence.path(frame)]
 
     work = FrameWork(recipe, record_in, products, sources, [map_mark], make)
     return work.run(frames.present, run, frames.absent)
+
+
+def _not_finite(image: Image) -> int:
+    """How many of a picture's values are NaN or infinite."""
+    count = 0
+    for values in image.layers.values():
+        if values.dtype == np.float32 or (values.dtype == np.float16 and not all_finite(values)):
+            count += values.size - int(np.count_nonzero(np.isfinite(values)))
+    return count
 
 
 def _has_grain(image: Image) -> bool:

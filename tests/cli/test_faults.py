@@ -538,6 +538,34 @@ def test_a_step_does_not_write_over_what_it_reads(shot, command, copied, tree):
         assert tree(frames) == before
 
 
+@pytest.mark.parametrize(
+    ("name", "folder", "position"),
+    [
+        ("capture", "source", 1),
+        ("plate", "photometric", 1),
+        ("matte", "source", 1),
+        ("scan", "sweep1", 1),
+        ("apply", "source", 4),
+    ],
+)
+@pytest.mark.parametrize("options", [[], ["--estimator", "minmax", "--holdout", "none"]])
+def test_frames_with_pixels_that_are_not_finite_are_named(
+    name, folder, position, options, shot, command, copied, tmp_path
+):
+    if options and name != "plate":
+        return
+    frames = copied(folder)
+    path = frames / f"{folder}.1003.exr"
+    image = read_image(path)
+    pixels = image.layers["RGB"].copy()
+    pixels[5, 6], pixels[7, 8, 1] = np.nan, np.inf
+    write_exr(path, {"RGB": pixels}, image.header)
+    words = replaced(shot.arguments(name), position, frames)
+    outcome = command(*words, *options, "-o", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert re.search(r"NaN or infinite in frames 1003 \(\d\)", outcome.err)
+
+
 def test_a_full_standard_output_is_named(shot, tmp_path):
     words = [*PROGRAM, *shot.arguments("plate"), "-o", str(tmp_path / "out")]
     with Path("/dev/full").open("w") as full:

@@ -202,6 +202,19 @@ def test_what_is_kept_in_memory_changes_no_bit(
     assert tree(tmp_path / "dip") == tree(level_plates / "dip")
 
 
+def test_a_take_without_shadow_is_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, takes: Path
+) -> None:
+    first = next(iter(sorted((takes / "dip").iterdir())))
+    (tmp_path / "still").mkdir()
+    for number in range(1001, 1009):
+        shutil.copyfile(first, tmp_path / "still" / f"still.{number}.exr")
+    plate(tmp_path / "still", tmp_path / "plates")
+    assert "no shadow moves over the scene" in caplog.text
+    matte(tmp_path / "still", tmp_path / "matte", plates=tmp_path / "plates")
+    assert "β is unknown in 100% of the picture" in caplog.text
+
+
 def test_sampled_frames_are_read_once_as_far_as_they_are_kept(
     takes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shadowtool.core.warp_map import WarpMap, identity_map
-from shadowtool.io.image import Header, read_image, write_exr
+from shadowtool.io.image import Header, read_image, write_exr, write_png
 from shadowtool.io.products import write_warp
 from shadowtool.steps.warp import warp
 
@@ -27,6 +27,15 @@ def grain() -> np.ndarray:
 
 def smooth() -> np.ndarray:
     return np.full((HEIGHT, WIDTH, 3), 0.5, np.float16)
+
+
+def test_a_pictures_alpha_is_warped_with_it(identity: Path, tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 4)).astype(np.uint8)
+    (tmp_path / "take").mkdir()
+    write_png(tmp_path / "take" / "take.1001.png", picture)
+    warp([], tmp_path / "out", map_file=identity, apply_to=tmp_path / "take")
+    found = read_image(tmp_path / "out" / "take" / "take.1001.exr").layers["RGBA"]
+    assert np.abs(found - picture / 255).max() < 1e-3
 
 
 @pytest.mark.parametrize("picture", [grain(), smooth()])

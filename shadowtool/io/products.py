@@ -95,23 +95,18 @@ def _plate(folder: Path, name: str) -> Path:
     raise InputError(f"{folder}: has no {name}{EXR}; make the plates with `shadowtool plate`")
 
 
-def plate_layers(
-    folder: Path, plates: Plates, contrast: NDArray[np.float32]
-) -> dict[Path, dict[str, NDArray[np.floating]]]:
-    """What is to be written for plates: layers by file; lit, shadow and confidence (channels
-    contrast, frames, and shadow_frames for plates that are not extremes).
+def confidence_layers(
+    plates: Plates, contrast: NDArray[np.float32]
+) -> dict[str, NDArray[np.floating]]:
+    """What ``confidence.exr`` holds: contrast, frames, and shadow_frames for plates that are not
+    extremes.
 
     The contrast becomes a half: further digits of it say nothing, and take up most of the room.
     """
-    lit, shadow, confidence = plate_files(folder)
-    frames = plates.frames if plates.frames is not None else np.zeros(contrast.shape)
-    layers: dict[str, NDArray[np.floating]] = {
-        "contrast": to_half(contrast),
-        "frames": frames.astype(np.float32),
-    }
-    if plates.shadow_frames is not None:
-        layers["shadow_frames"] = plates.shadow_frames.astype(np.float32)
-    return {lit: {"RGB": plates.lit}, shadow: {"RGB": plates.shadow}, confidence: layers}
+    counts = {"frames": plates.frames, "shadow_frames": plates.shadow_frames}
+    layers: dict[str, NDArray[np.floating]] = {"contrast": to_half(contrast)}
+    layers |= {name: n.astype(np.float32) for name, n in counts.items() if n is not None}
+    return layers
 
 
 def write_scan(folder: Path, scan: Pass, header: Header, provenance: Provenance) -> None:

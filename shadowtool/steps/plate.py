@@ -37,7 +37,7 @@ from shadowtool.core.robust_plates import (
 from shadowtool.errors import DamagedFileError, InputError, OptionError
 from shadowtool.io.files import fingerprint_file, is_file, make_folder, new_folders
 from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
-from shadowtool.io.products import MANIFEST, plate_files, plate_layers
+from shadowtool.io.products import MANIFEST, confidence_layers, plate_files
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import Footage, open_footage, require_frames, require_size
@@ -183,7 +183,7 @@ def plate(
         yield shadow, {"RGB": plates.shadow}
         figures.update(more)
         contrast = shadow_contrast(plates, estimate.noise)
-        yield confidence, plate_layers(output, plates, contrast)[confidence]
+        yield confidence, confidence_layers(plates, contrast)
 
     def write(item: tuple[Path, dict[str, NDArray[np.floating]]]) -> None:
         write_exr(item[0], item[1], footage.header, provenance, quick=True)

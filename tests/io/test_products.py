@@ -21,9 +21,9 @@ from shadowtool.io.products import (
     LINES,
     MANIFEST,
     SCAN,
+    confidence_layers,
     folder_lock,
     plate_files,
-    plate_layers,
     read_plates,
     read_record,
     read_scan,
@@ -39,7 +39,9 @@ MADE = {"version": "1", "command": "shadowtool warp", "fingerprint": "f"}
 
 
 def write_plates(folder, plates, contrast, header, provenance):
-    for path, layers in plate_layers(folder, plates, contrast).items():
+    colours = ({"RGB": plates.lit}, {"RGB": plates.shadow})
+    layers_of = [*colours, confidence_layers(plates, contrast)]
+    for path, layers in zip(plate_files(folder), layers_of, strict=True):
         write_exr(path, layers, header, provenance)
 
 

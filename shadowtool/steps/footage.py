@@ -1,5 +1,6 @@
 """Footage: a sequence whose frames are known to fit together, read as linear light."""
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
 from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,16 @@ def open_footage(
     if first is None:
         raise DamagedFileError(f"{sequence.pattern}: no frame can be read")
     return Footage(sequence, first, resolve_transfer(transfer, next(iter(sequence.files.values()))))
+
+
+def say_assumed(footage: Footage, transfer: str) -> None:
+    """Say what code values are taken for, if that was not given and is not light itself."""
+    if transfer == "auto" and footage.transfer != "linear":
+        logger.warning(
+            "%s: PNG is taken as %s; give --transfer if it is not",
+            footage.sequence.pattern,
+            footage.transfer,
+        )
 
 
 def _require_same(path: Path, header: Header, first: Header, of: str) -> None:

@@ -32,7 +32,13 @@ from shadowtool.errors import OptionError
 from shadowtool.io.image import EXR, PNG, Header, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import read_plates
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
-from shadowtool.steps.footage import Footage, open_footage, require_frames, require_size
+from shadowtool.steps.footage import (
+    Footage,
+    open_footage,
+    require_frames,
+    require_size,
+    say_assumed,
+)
 from shadowtool.steps.keyframes import Keyframes
 from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
 
@@ -92,6 +98,7 @@ def matte(
         OptionError: trimaps, given or wanted, beside an alpha.
     """
     footage = open_footage(source, "frames", transfer, run.missing)
+    say_assumed(footage, transfer)
     frames, absent = footage.sequence.select(run.frames, run.missing)
     stored = read_plates(plates)
     require_size(plates, stored.header, footage.header, footage.sequence.pattern)

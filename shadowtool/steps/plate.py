@@ -40,7 +40,13 @@ from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, confidence_layers, plate_files
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.parallel import ordered_map
-from shadowtool.steps.footage import Footage, open_footage, require_frames, require_size
+from shadowtool.steps.footage import (
+    Footage,
+    open_footage,
+    require_frames,
+    require_size,
+    say_assumed,
+)
 from shadowtool.steps.plane import read_plane
 from shadowtool.steps.run import (
     Figures,
@@ -95,6 +101,7 @@ def plate(
         DamagedFileError: a frame can't be read.
     """
     footage = open_footage(source, "frames", transfer, run.missing)
+    say_assumed(footage, transfer)
     frames, absent = footage.sequence.select(run.frames, run.missing)
     automatic = holdout == "auto"
     held = (

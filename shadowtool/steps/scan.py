@@ -41,7 +41,7 @@ from shadowtool.io.image import write_png
 from shadowtool.io.products import LINES, MANIFEST, SCAN, write_scan
 from shadowtool.io.sequence import Frame
 from shadowtool.parallel import ordered_map
-from shadowtool.steps.footage import Footage, open_footage
+from shadowtool.steps.footage import Footage, open_footage, say_assumed
 from shadowtool.steps.plane import read_plane
 from shadowtool.steps.run import (
     Figures,
@@ -98,6 +98,7 @@ def scan(
         ReshootError: the plane shows too little of the sweep.
     """
     footage = open_footage(source, "frames", transfer, run.missing)
+    say_assumed(footage, transfer)
     frames, absent = footage.sequence.select(run.frames, run.missing)
     if len(frames) < 3:
         raise InputError(f"{footage.sequence.pattern}: {len(frames)} frames make no sweep")

@@ -202,6 +202,19 @@ def test_what_is_kept_in_memory_changes_no_bit(
     assert tree(tmp_path / "dip") == tree(level_plates / "dip")
 
 
+def test_what_code_values_are_taken_for_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for number in range(1001, 1004):
+        picture = np.full((HEIGHT, WIDTH, 3), number % 7, np.uint8)
+        (tmp_path / "take").mkdir(exist_ok=True)
+        write_png(tmp_path / "take" / f"take.{number}.png", picture)
+    plate(tmp_path / "take", tmp_path / "told", transfer="srgb")
+    assert "taken as" not in caplog.text
+    plate(tmp_path / "take", tmp_path / "assumed")
+    assert "PNG is taken as srgb" in caplog.text
+
+
 def test_a_take_without_shadow_is_told_of(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, takes: Path
 ) -> None:

@@ -244,6 +244,8 @@ def _require_st_map(image: Image, st_map: NDArray[np.float32]) -> None:
     step = image.header.provenance.get("command", "shadowtool warp").split()[1:2]
     if step != ["warp"]:
         raise InputError(f"{image.path}: was made by `shadowtool {''.join(step)}`, is no ST map")
+    if image.header.bits == 8:
+        raise InputError(f"{image.path}: 8 bits can't tell pixels apart; give an ST map in EXR")
     known = st_map[np.isfinite(st_map).all(axis=-1)]
     # A map in pixels, or of displacements, has most of its values elsewhere.
     if not known.size or np.median(np.abs(known - 0.5)) > _FAR_OUTSIDE:

@@ -3,7 +3,7 @@
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -31,14 +31,14 @@ class Keyframes:
     Attributes:
         drawn: their files.
         footage: the take.
-        missing: whether frames on the way that can't be read are passed over.
         links: between two frames, there and back.
+        readable: whether a frame can be read.
     """
 
     drawn: Sequence
     footage: Footage
-    missing: Missing
     links: Callable[[Frame, Frame], tuple[Link, Link]]
+    readable: Callable[[Frame], bool]
 
     @classmethod
     def of(cls, drawn: Sequence, footage: Footage, missing: Missing) -> "Keyframes":
@@ -54,7 +54,17 @@ class Keyframes:
         def between(here: Frame, there: Frame) -> tuple[Link, Link]:
             return links(*(flow_picture(footage.read(frame)) for frame in (here, there)))
 
-        return cls(drawn, footage, missing, lru_cache(_FURTHEST)(between))
+        @cache
+        def readable(frame: Frame) -> bool:
+            try:
+                footage.read(frame)
+            except DamagedFileError:
+                return False
+            return True
+
+        # Where damage is an error, reading for the links says so.
+        passed = readable if missing == "skip" else lambda frame: True
+        return cls(drawn, footage, lru_cache(_FURTHEST)(between), passed)
 
     def sources(self, frame: Frame) -> list[Path]:
         """What a frame's trimap is made of."""
@@ -87,17 +97,8 @@ class Keyframes:
         return way if frame <= key else way[::-1]
 
     def _carried(self, frame: Frame, key: Frame) -> Carried:
-        way = [step for step in self._way(frame, key) if self._can_be_read(step)]
+        way = [step for step in self._way(frame, key) if self.readable(step)]
         return carry(trimap_of(self.drawn.path(key)), [self._link(*pair) for pair in pairwise(way)])
-
-    def _can_be_read(self, frame: Frame) -> bool:
-        if self.missing == "error":
-            return True
-        try:
-            self.footage.read(frame)
-        except DamagedFileError:
-            return False
-        return True
 
     def _link(self, here: Frame, there: Frame) -> Link:
         there_and_back = self.links(min(here, there), max(here, there))

@@ -566,6 +566,13 @@ def test_frames_with_pixels_that_are_not_finite_are_named(
     assert re.search(r"NaN or infinite in frames 1003 \(\d\)", outcome.err)
 
 
+def test_a_picture_of_eight_bits_is_no_map(shot, refused, tmp_path):
+    path = tmp_path / "map.png"
+    write_png(path, np.full((32, 48, 3), 128, np.uint8))
+    said = refused(["warp", "--map", path, "--apply", shot.source])
+    assert "map.png: 8 bits can't tell pixels apart" in said
+
+
 def test_a_full_standard_output_is_named(shot, tmp_path):
     words = [*PROGRAM, *shot.arguments("plate"), "-o", str(tmp_path / "out")]
     with Path("/dev/full").open("w") as full:

@@ -1,5 +1,6 @@
 """The figure from footage on disk, alone and with trimaps drawn for some frames."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -115,6 +116,19 @@ def test_keyframes_give_the_same_bits_whatever_the_jobs_and_the_split(
     parts = whole.parent / "parts"
     for folder in ("trimap", "fg", "beta"):
         assert tree(parts / folder) == tree(whole / folder)
+
+
+def test_trimaps_are_carried_past_a_damaged_frame(take: Path, tmp_path: Path) -> None:
+    shutil.copytree(take / "source", tmp_path / "source")
+    bad = tmp_path / "source" / "source.1004.exr"
+    bad.write_bytes(bad.read_bytes()[:-500])
+    options = {"plates": take / "plates", "trimap": take / "trimaps"}
+    run = Run(missing="skip")
+    result = matte(tmp_path / "source", tmp_path / "out", run=run, **options)
+    assert result.skipped == [1004]
+    for number in (1003, 1005):
+        _, alpha = read_image(tmp_path / "out" / "fg" / f"fg.{number}.exr").rgba()
+        assert np.abs(alpha - figure(number).alpha).mean() < 0.004
 
 
 def test_bands_change_no_bit(pull: Callable[..., Path], tree, narrow_bands) -> None:

@@ -4,6 +4,8 @@ OpenCV converts with the processor's instructions for it; subtracting 0 leaves e
 the sign of 0 too.
 """
 
+from functools import reduce
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -60,12 +62,15 @@ def all_finite(halfs: Float16) -> bool:
 
 
 def not_finite(image: NDArray[np.floating]) -> NDArray[np.bool_] | None:
-    """Where a channel of an image (H, W, 3) is NaN or infinite, (H, W); None for nowhere."""
+    """Where an image (H, W), or a channel of one (H, W, C), is NaN or infinite, (H, W); None for
+    nowhere."""
     if image.dtype == np.float16 and all_finite(image.astype(np.float16, copy=False)):
         return None
     # By channel: to reduce an axis of three is slow.
     finite = np.isfinite(image)
-    bad = np.asarray(~(finite[..., 0] & finite[..., 1] & finite[..., 2]))
+    if finite.ndim == 3:
+        finite = reduce(np.logical_and, np.moveaxis(finite, -1, 0))
+    bad = np.asarray(~finite)
     return bad if bad.any() else None
 
 

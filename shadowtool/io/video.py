@@ -134,12 +134,13 @@ class Movie:
         matrix = int(context.colorspace)
         self._full = int(context.color_range) == _FULL_RANGE or pixel_format.name.startswith("yuvj")
         if not self._rgb and not self._gray:
-            if (code := matrix) not in _MATRICES:
-                named = code not in _UNSPECIFIED
+            if matrix not in _MATRICES:
+                said = f"matrix {matrix}, which is not known here"
+                if matrix in _UNSPECIFIED:
+                    said = "no colour matrix"
                 high = context.width > 1024 or context.height > 576
                 matrix = 1 if high else 6
                 name = "Rec.709" if high else "Rec.601"
-                said = f"matrix {code}, which is not known here" if named else "no colour matrix"
                 assumed.append(f"the movie names {said}: {name} is assumed by its size")
             self._weights = _MATRICES[matrix]
         if not self._rgb and int(context.color_range) == 0 and not self._full:

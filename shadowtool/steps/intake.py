@@ -117,6 +117,9 @@ def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
     info = movie.info
     if info.transfer is None and transfer == "auto":
         raise InputError(f"{path}: its transfer function can't be undone here; give --transfer")
+    assumed = list(info.assumed)
+    if transfer == "auto" and info.assumed_transfer:
+        assumed.append(info.assumed_transfer)
     wanted = None if frames is None else parse_frames(frames)
     chosen = None if wanted is None else set(wanted)
     mark = fingerprint_movie(path)
@@ -151,10 +154,7 @@ def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
         fingerprint=mark,
         header=header,
         transfer=info.transfer or transfer,
-        assumed=[
-            *info.assumed,
-            *([info.assumed_transfer] if transfer == "auto" and info.assumed_transfer else []),
-        ],
+        assumed=assumed,
         bits=info.bits,
         wanted=wanted,
         total=len(wanted) if wanted is not None else info.frames or 0,

@@ -171,7 +171,6 @@ class FrameWork:
         """
         refuse_existing((file for frame in frames for file in self.products(frame)), run)
         refuse_other_step(self.recipe.step, self.output, run)
-        self._refuse_inputs(frames)
         folders = {file.parent for frame in frames for file in self.products(frame)}
         rows: dict[str, Figures] = {}
         skipped, kept = list(absent), 0
@@ -192,22 +191,11 @@ class FrameWork:
         done = [frame for frame in frames if str(frame) in rows]
         return Result(self.recipe.step, self.output, done, kept, skipped, figures)
 
-    def _refuse_inputs(self, frames: Sequence[Frame]) -> None:
-        """Stop before a step writes over what it reads."""
-        for frame in frames:
-            try:
-                sources = {file.name: file for file in self.sources(frame)}
-            except InputError:
-                # Said, or skipped, in the frame's turn.
-                continue
-            for file in self.products(frame):
-                source = sources.get(file.name)
-                if source is not None and is_file(file) and file.samefile(source):
-                    raise OptionError(f"{file}: is a frame to be read; give another -o")
-
     def _frame(self, frame: Frame, run: Run) -> tuple[Figures, bool] | None:
         try:
-            with fingerprinted(self.sources(frame)) as inputs:
+            sources = self.sources(frame)
+            _refuse_inputs(self.products(frame), sources)
+            with fingerprinted(sources) as inputs:
                 mark = self.recipe.fingerprint([*self.shared, *inputs])
                 if run.resume and (figures := current(self.products(frame), mark)) is not None:
                     return {"fingerprint": mark, **figures}, True
@@ -233,6 +221,15 @@ class FrameWork:
                 merged, figures = rows, summary(list(rows.values()))
             write_manifest(self.output, self.recipe, key, figures, merged)
         return figures
+
+
+def _refuse_inputs(products: Iterable[Path], sources: Iterable[Path]) -> None:
+    """Stop before a step writes over what it reads."""
+    read = {file.name: file for file in sources}
+    for file in products:
+        source = read.get(file.name)
+        if source is not None and is_file(file) and is_file(source) and file.samefile(source):
+            raise OptionError(f"{file}: is a frame to be read; give another -o")
 
 
 def warn_of_nan(output: Path, counts: Mapping[str, int]) -> None:

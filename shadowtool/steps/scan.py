@@ -64,7 +64,7 @@ PICTURE = "scan.png"
 
 # Bends of more pixels than this, that are so many standard deviations, come from a lens.
 _BENT, _CERTAIN = 1.0, 6.0
-# Single floats tell frames of higher numbers into less than a sixteenth.
+# From this frame number on single floats are an eighth of a frame apart, or more.
 _FEW_DIGITS = 2**20
 # A sweep reaches little of the frame, and is fast: a part of the frame, pixels a frame.
 _LITTLE, _FAST = 0.5, 20.0
@@ -266,8 +266,9 @@ def _times(
     in_shade = loss < SHADE
     own[in_shade], own_error[in_shade] = np.nan, np.inf
     own_error /= np.maximum(loss, SHADE) ** 2
-    in_hole = np.append(False, _holes(numbers))[crossings.at]
-    own[in_hole], own_error[in_hole] = np.nan, np.inf
+    if (holes := _holes(numbers)).any():
+        in_hole = np.append(False, holes)[crossings.at]
+        own[in_hole], own_error[in_hole] = np.nan, np.inf
     time, error = np.empty_like(own), np.empty_like(own_error)
     windows = time_windows(own, region)
     raised = understated(own, own_error, region, windows)

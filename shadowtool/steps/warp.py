@@ -10,7 +10,7 @@ import numpy as np
 from shadowtool.core.bands import bands, in_all_channels
 from shadowtool.core.diffusion import diffuse
 from shadowtool.core.epipole import Epipole
-from shadowtool.core.half_floats import all_finite, to_float, to_half
+from shadowtool.core.half_floats import not_finite, to_float, to_half
 from shadowtool.core.inverse_map import compose, invert
 from shadowtool.core.pictures import warp_picture
 from shadowtool.core.warp_map import (
@@ -275,12 +275,10 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
 
 
 def _not_finite(image: Image) -> int:
-    """How many of a picture's values are NaN or infinite."""
-    count = 0
-    for values in image.layers.values():
-        if values.dtype == np.float32 or (values.dtype == np.float16 and not all_finite(values)):
-            count += values.size - int(np.count_nonzero(np.isfinite(values)))
-    return count
+    """In how many pixels a layer of a picture is NaN or infinite."""
+    found = [not_finite(values) for values in image.layers.values() if values.dtype.kind == "f"]
+    bad = [where for where in found if where is not None]
+    return int(np.count_nonzero(reduce(np.logical_or, bad))) if bad else 0
 
 
 def _has_grain(image: Image) -> bool:

@@ -539,31 +539,24 @@ def test_a_step_does_not_write_over_what_it_reads(shot, command, copied, tree):
 
 
 @pytest.mark.parametrize(
-    ("name", "folder", "position"),
-    [
-        ("capture", "source", 1),
-        ("plate", "photometric", 1),
-        ("matte", "source", 1),
-        ("scan", "sweep1", 1),
-        ("apply", "source", 4),
-    ],
+    ("name", "options"),
+    [*((name, []) for name in FOOTAGE), ("plate", ["--estimator", "minmax", "--holdout", "none"])],
 )
-@pytest.mark.parametrize("options", [[], ["--estimator", "minmax", "--holdout", "none"]])
 def test_frames_with_pixels_that_are_not_finite_are_named(
-    name, folder, position, options, shot, command, copied, tmp_path
+    name, options, shot, command, copied, tmp_path
 ):
-    if options and name != "plate":
-        return
+    folder, position = FOOTAGE[name]
     frames = copied(folder)
-    path = frames / f"{folder}.1003.exr"
+    path = frames / f"{frames.name}.1003.exr"
     image = read_image(path)
-    pixels = image.layers["RGB"].copy()
-    pixels[5, 6], pixels[7, 8, 1] = np.nan, np.inf
-    write_exr(path, {"RGB": pixels}, image.header)
+    layers = {layer: values.copy() for layer, values in image.layers.items()}
+    pixels = np.atleast_3d(layers["Y" if name == "apply" else "RGB"])
+    pixels[5, 6], pixels[7, 8, -1] = np.nan, np.inf
+    write_exr(path, layers, image.header)
     words = replaced(shot.arguments(name), position, frames)
     outcome = command(*words, *options, "-o", tmp_path / "out")
     assert outcome.code == 0, outcome.err
-    assert re.search(r"NaN or infinite in frames 1003 \(\d\)", outcome.err)
+    assert "NaN or infinite in frames 1003 (2)" in outcome.err
 
 
 def test_a_picture_of_eight_bits_is_no_map(shot, refused, tmp_path):

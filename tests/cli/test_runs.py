@@ -480,6 +480,16 @@ def jolted(tmp_path) -> Path:
     return write_frames(tmp_path / "jolted", map(np.ascontiguousarray, views))
 
 
+def test_an_edited_record_of_a_capture_does_no_harm(make, tree):
+    whole = make("capture", "take")
+    before = tree(whole)
+    record = json.loads((whole / "shadowtool.json").read_text())
+    record["frames"] = dict.fromkeys(record["frames"], "edited")
+    (whole / "shadowtool.json").write_text(json.dumps(record))
+    (whole / "capture.json").write_text(json.dumps({"camera_motion": "edited"}))
+    assert tree(make("capture", "take", "--resume")) == before
+
+
 def test_a_camera_that_moved_is_refused_again(jolted, command, tmp_path):
     words = ["capture", jolted, "-o", tmp_path / "out", "--strict", "--resume"]
     for _ in range(2):

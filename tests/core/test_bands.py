@@ -16,12 +16,9 @@ def test_every_row_is_in_one_band(shape, channels):
 
 
 def test_bands_hold_about_as_many_values_whatever_the_width():
-    held = []
     for width in (1920, 3840):
         band = next(iter(bands((2160, width))))
-        held.append((band.stop - band.start) * width)
-    assert held[0] == pytest.approx(held[1], rel=0.1)
-    assert held[0] < 2160 * 1920 / 4
+        assert 200_000 < (band.stop - band.start) * width * 3 < 400_000
 
 
 def test_a_plane_is_the_same_in_all_channels():

@@ -51,8 +51,10 @@ clean:
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
+# Compiled once, for accounts that may not write here.
 .venv/installed: pyproject.toml | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	$(BIN)/python -m compileall -q shadowtool
 	touch $@
 
 .venv/installed-dev: pyproject.toml | .venv/bin/python

@@ -72,6 +72,11 @@ def _closed_in(ratios: Float32, centre: float, spread: float = 0.0) -> float:
     return centre
 
 
+def _median(values: Float32) -> float:
+    """Of numbers (N,), the upper one of two; by a sort, several times faster than numpy's own."""
+    return float(np.sort(values)[values.size // 2])
+
+
 def sampled_areas(gray: NDArray[np.floating]) -> Float32:
     """Means of runs of pixels in evenly spaced rows, (H, W) to (h, w); what is left over at the
     right is left out."""
@@ -110,8 +115,8 @@ class RunningGain:
         changes = _ratios(gray, self._last)
         if changes.size < _LEAST_PIXELS:
             return self._gain()
-        middle = float(np.median(changes))
-        spread = 1.48 * float(np.median(np.abs(changes - middle)))
+        middle = _median(changes)
+        spread = 1.48 * _median(np.abs(changes - middle))
         expected = self._logarithm + _closed_in(changes, middle, spread)
         ratios = _ratios(gray, self._first)
         same = np.abs(ratios - expected) < max(_NEAR[0], spread)

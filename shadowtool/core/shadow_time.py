@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
 from shadowtool.core.crossings import LEAST_CONTRAST, Crossings
-from shadowtool.core.half_floats import rounded, to_float
+from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plane_fits import Windows, fit_planes
 from shadowtool.core.transfer import LUMA
@@ -85,20 +85,21 @@ def luminance(image: NDArray[np.floating]) -> Float32:
     """(H, W, 3) linear RGB to (H, W) float32; not finite where a channel isn't."""
     gray = np.empty(image.shape[:2], np.float32)
     for rows in bands(image.shape):
-        gray[rows] = _gray(image[rows])
+        gray[rows] = cv2.transform(to_float(image[rows]), LUMA[np.newaxis])
     return gray
 
 
-def luminance_halfs(image: NDArray[np.floating]) -> NDArray[np.float16]:
-    """`luminance`, rounded to halfs; infinite where it is too large for one."""
-    gray = np.empty(image.shape[:2], np.float16)
-    for rows in bands(image.shape):
-        gray[rows] = rounded(_gray(image[rows]))
+def luminance_halfs(
+    red: NDArray[np.floating], green: NDArray[np.floating], blue: NDArray[np.floating]
+) -> NDArray[np.float16]:
+    """`luminance` of three channels (H, W), rounded to halfs; infinite where it is too large for
+    one. From halfs it is found twice as fast as from a picture (H, W, 3)."""
+    of_red, of_green, of_blue = LUMA.tolist()
+    gray = np.empty(red.shape, np.float16)
+    for rows in bands(red.shape):
+        two = cv2.addWeighted(red[rows], of_red, green[rows], of_green, 0, dtype=cv2.CV_32F)
+        cv2.addWeighted(two, 1, blue[rows], of_blue, 0, gray[rows], cv2.CV_16F)
     return gray
-
-
-def _gray(image: NDArray[np.floating]) -> Float32:
-    return np.asarray(cv2.transform(to_float(image), LUMA[np.newaxis]), np.float32)
 
 
 def significant(crossings: Crossings, noise: NoiseModel) -> Crossings:

@@ -11,7 +11,7 @@ import logging
 import struct
 import threading
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
@@ -87,7 +87,8 @@ class Image:
         path: where it came from.
         header: see `Header`.
         layers: arrays by name, (H, W) or (H, W, C), of the display window's size; float16 or
-            float32, PNG's 8 and 16 bit as uint8 and uint16. Colour stands under "RGB" or "RGBA".
+            float32, PNG's 8 and 16 bit as uint8 and uint16. Colour stands under "RGB" or "RGBA",
+            or in channels "R", "G" and "B" of their own if that was asked for.
         fingerprint: of the file's content.
     """
 
@@ -110,9 +111,20 @@ class Image:
         Raises:
             InputError: there is no colour that could be meant.
         """
-        name = self._colour_layer()
-        values = self.layers[name]
-        return decode(_three_channels(values), resolve_transfer(transfer, self.path))
+        if set("RGB") <= self.layers.keys():
+            values = _joined([self.layers[name] for name in "RGB"])
+        else:
+            values = _three_channels(self.layers[self._colour_layer()])
+        return decode(values, resolve_transfer(transfer, self.path))
+
+    def colours(self, transfer: str = "auto") -> tuple[NDArray[np.floating], ...]:
+        """The three channels of `rgb`, (H, W) each."""
+        if set("RGB") <= self.layers.keys():
+            stored = [self.layers[name] for name in "RGB"]
+        else:
+            values = _three_channels(self.layers[self._colour_layer()])
+            stored = [_one_channel(values, index) for index in range(3)]
+        return tuple(decode(values, resolve_transfer(transfer, self.path)) for values in stored)
 
     def rgba(self, transfer: str = "auto") -> tuple[Float32, Float32]:
         """Premultiplied colour (H, W, 3) and alpha (H, W), linear light.
@@ -197,6 +209,8 @@ def decode(values: NDArray[Any], transfer: str) -> NDArray[np.floating]:
     """Code values of any stored type to linear light; halfs that are linear stay as they are."""
     if values.dtype in (np.uint8, np.uint16):
         return np.asarray(cv2.LUT(values, _table(transfer, values.dtype.name)))
+    if values.dtype == np.uint32:
+        values = values.astype(np.float32)
     if transfer in ("linear", "none"):
         return values
     return TRANSFERS[transfer].decode(values)
@@ -214,6 +228,14 @@ def _three_channels(values: NDArray[Any]) -> NDArray[Any]:
     if values.ndim == 2:
         return cv2.merge([bits, bits, bits]).view(values.dtype)
     return values if values.shape[2] == 3 else cv2.merge(cv2.split(bits)[:3]).view(values.dtype)
+
+
+def _joined(channels: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Channels (H, W) as (H, W, C): of their type, or single floats if they are of several."""
+    kinds = {values.dtype for values in channels}
+    kind = kinds.pop() if len(kinds) == 1 else np.dtype(np.float32)
+    whole = [_for_opencv(values.astype(kind, copy=False)) for values in channels]
+    return cv2.merge(whole).view(kind)
 
 
 def _one_channel(values: NDArray[Any], index: int) -> NDArray[Any]:
@@ -251,8 +273,12 @@ def read_header(path: Path) -> Header:
         return read_image(path).header
 
 
-def read_image(path: Path) -> Image:
+def read_image(path: Path, apart: bool = False) -> Image:
     """Read a picture whole.
+
+    Args:
+        apart: leave an EXR's channels R, G and B as they are in the file, each for itself, for
+            `Image.colours`.
 
     Raises:
         InputError: as `read_header`.
@@ -261,7 +287,7 @@ def read_image(path: Path) -> Image:
     if path.suffix.lower() == PNG:
         return _decode_png(path, read_content(path))
     with unchanging(path) as (source, fingerprint):
-        return _decode_exr(path, source, fingerprint)
+        return _decode_exr(path, source, fingerprint, apart)
 
 
 def write_exr(
@@ -438,13 +464,14 @@ def _window(path: Path, raw: Mapping[str, Any], name: str) -> tuple[Corner, Corn
     return (first[0], first[1]), (last[0], last[1])
 
 
-def _decode_exr(path: Path, source: str | BinaryIO, fingerprint: str) -> Image:
+def _decode_exr(path: Path, source: str | BinaryIO, fingerprint: str, apart: bool) -> Image:
     # The header first: a picture that is refused must not be decoded, and a damaged part of a
     # multi-part file vanishes without a word when the pixels are read.
     listed = _open_exr(path, source, header_only=True)
     header = _exr_header(path, listed)
+    apart = apart and set("RGB") <= {channel.name for channel in listed.header(0)["channels"]}
     try:
-        file = _open_exr(path, source)
+        file = _open_exr(path, source, separate=apart)
     except DamagedFileError:
         # OpenEXR joins R, G, B to one array only where they are of one type.
         file = _open_exr(path, source, separate=True)
@@ -462,10 +489,9 @@ def _decode_exr(path: Path, source: str | BinaryIO, fingerprint: str) -> Image:
         layers[name] = _placed(values, first, header)
     if not layers:
         raise InputError(f"{path}: has no channels")
-    if {"R", "G", "B"} <= layers.keys():
+    if not apart and set("RGB") <= layers.keys():
         names = [name for name in "RGBA" if name in layers]
-        colour = np.stack([layers.pop(name).astype(np.float32) for name in names], axis=-1)
-        layers["".join(names)] = colour
+        layers["".join(names)] = _joined([layers.pop(name) for name in names])
     return Image(path, header, layers, fingerprint)
 
 

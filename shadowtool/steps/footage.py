@@ -38,13 +38,16 @@ class Footage:
     header: Header
     transfer: str
 
-    def image(self, frame: Frame) -> Image:
+    def image(self, frame: Frame, apart: bool = False) -> Image:
         """Read a frame.
+
+        Args:
+            apart: as of `read_image`.
 
         Raises:
             InputError, DamagedFileError: it can't be read, or is of another size.
         """
-        image = read_image(self.sequence.path(frame))
+        image = read_image(self.sequence.path(frame), apart)
         _require_same(image.path, image.header, self.header, self.sequence.pattern)
         return image
 

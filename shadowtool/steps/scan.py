@@ -197,15 +197,15 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
 
     def read(position: int) -> _Seen | None:
         try:
-            image = footage.image(frames[position])
+            image = footage.image(frames[position], apart=True)
         except DamagedFileError:
             if run.missing == "skip":
                 return None
             raise
-        values = image.rgb(footage.transfer)
-        sample = thin(values) if position in samples.values() else None
-        picture = display(values) if position == 0 else None
-        gray = luminance_halfs(values)
+        light = footage.transfer
+        sample = thin(image.rgb(light)) if position in samples.values() else None
+        picture = display(image.rgb(light)) if position == 0 else None
+        gray = luminance_halfs(*image.colours(light))
         return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
 
     finder, exposure = CrossingFinder(), RunningGain()
@@ -241,7 +241,7 @@ def _looked_at_again(
     look = SecondLook(crossings, crossings.lost)
 
     def read(frame: Frame) -> Float16:
-        return luminance_halfs(footage.read(frame))
+        return luminance_halfs(*footage.image(frame, apart=True).colours(footage.transfer))
 
     for done, (gray, own) in enumerate(
         zip(ordered_map(read, gains, run.jobs), gains.values(), strict=True), start=1

@@ -555,6 +555,31 @@ def test_colour_channels_of_different_types_are_read(tmp_path):
     np.testing.assert_array_equal(image.plane("R"), channels["R"].astype(np.float32))
 
 
+@pytest.mark.parametrize("types", ["eff", "eee", "fff", "III"])
+@pytest.mark.parametrize("alpha", [False, True])
+def test_colour_read_apart_is_the_same(types, alpha, tmp_path):
+    channels = {n: (9 * random(4, 5)).astype(t) for n, t in zip("RGB", types, strict=True)}
+    if alpha:
+        channels["A"] = random(4, 5, dtype=np.float16)
+    window = {"dataWindow": box(2, 1, 5, 4), "displayWindow": box(0, 0, 6, 7)}
+    path = raw_exr(tmp_path / "a.exr", channels, **window)
+    apart, whole = read_image(path, apart=True), read_image(path)
+    for transfer in ("auto", "srgb"):
+        colour = whole.rgb(transfer)
+        np.testing.assert_array_equal(apart.rgb(transfer), colour)
+        for image in (apart, whole):
+            for index, channel in enumerate(image.colours(transfer)):
+                np.testing.assert_array_equal(channel, colour[..., index])
+
+
+def test_colours_of_other_pictures_are_those_of_rgb(tmp_path, png):
+    grey = raw_exr(tmp_path / "y.exr", {"Y": random(4, 5)})
+    layer = raw_exr(tmp_path / "d.exr", {f"diffuse.{c}": random(4, 5) for c in "RGB"})
+    for path in (grey, layer, png):
+        image = read_image(path, apart=True)
+        np.testing.assert_array_equal(np.stack(image.colours(), axis=-1), image.rgb())
+
+
 @pytest.mark.parametrize("names", ["RG", "UV", "AB", "X", "NYX"])
 def test_channels_without_a_picture_are_read_one_by_one(names, tmp_path):
     channels = {name: random(4, 5, seed=ord(name)) for name in names}

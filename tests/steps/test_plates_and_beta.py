@@ -233,9 +233,9 @@ def test_sampled_frames_are_read_once_as_far_as_they_are_kept(
 ) -> None:
     read = []
 
-    def counting(path: Path) -> Image:
+    def counting(path: Path, apart: bool = False) -> Image:
         read.append(path)
-        return read_image(path)
+        return read_image(path, apart)
 
     monkeypatch.setattr("shadowtool.steps.footage.read_image", counting)
     plate(takes / "walk", tmp_path / "kept")

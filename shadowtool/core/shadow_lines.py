@@ -245,6 +245,9 @@ def zero_crossings(
     if not indices:
         return {}
     index, point = np.concatenate(indices), np.concatenate(points)
+    # Noise takes a time beyond the first frame or the last.
+    looked_at = (index >= 0) & (index < len(frames))
+    index, point = index[looked_at], point[looked_at]
     order = np.argsort(index, kind="stable")
     index, point = index[order], point[order]
     cuts = np.nonzero(np.diff(index))[0] + 1

@@ -69,6 +69,12 @@ def test_a_turning_stick_is_followed() -> None:
     assert np.percentile(errors(lines, sweep), 90) < 0.1
 
 
+def test_times_before_the_first_frame_and_after_the_last_make_no_crossing() -> None:
+    ramp = np.tile(np.arange(20, dtype=np.float32) / 2 - 1.3, (5, 1)) + 1001
+    points = zero_crossings(ramp, np.ones(ramp.shape, bool), 1001 + np.arange(6.0))
+    assert sorted(points) == list(range(6))
+
+
 def test_crossings_lie_where_time_equals_the_frame() -> None:
     ramp = np.tile(np.arange(20, dtype=np.float32) / 2 + 0.3, (5, 1))
     points = zero_crossings(ramp, np.ones(ramp.shape, bool), np.arange(11.0))

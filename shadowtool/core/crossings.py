@@ -27,9 +27,9 @@ LEAST_CONTRAST = 2 * (1 - float(_NEARLY_LIT))
 # half, 0.00006.
 _NEARLY_LIT_KEYS = np.int16(41)
 # How many frames are in hand, those that wait to be looked at together among them. Times of edges
-# that take longer than about fifty frames are not worth having.
-_BYTES, _LEAST, _MOST = 2**28, 8, 36
-_WAITING = 1 / 4
+# that take longer than about forty frames are not worth having.
+_BYTES, _LEAST, _MOST = 2**28, 8, 30
+_WAITING = 0.3
 # Pixels that are looked at together: an array of as many keys is 1 MB. With fewer, this thread
 # would wait for those that read at every step.
 _BLOCK = 1 << 19
@@ -107,8 +107,8 @@ class CrossingFinder:
     def __init__(self, in_hand: int | None = None, together: int | None = None) -> None:
         """Args:
         in_hand: how many frames are kept, three or more; an edge may take one and a half times as
-            many to pass. None for as many as are no burden to memory, and 36 at most.
-        together: how many of them are looked at at a time; None for a quarter.
+            many to pass. None for as many as are no burden to memory, and 30 at most.
+        together: how many of them are looked at at a time; None for three tenths.
         """
         self._in_hand, self._together = in_hand, together
         self._waiting: list[Int16] = []

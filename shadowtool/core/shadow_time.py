@@ -50,8 +50,9 @@ _MOVED = 3.0
 # Half the widths of the windows in which times are taken for linear, pixels.
 _RADII = (2, 5)
 _WINDOWS = Windows(_RADII)
-# Less than this part of the usual loss of light is that of a pixel in shade.
-SHADE = 0.3
+# Less than this part of the usual loss of light is that of a pixel in shade. What else than the key
+# light is lost moves a time by up to so much of the edge's duration, for each part of the key's.
+SHADE, _MISLED = 0.3, 0.2
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,7 @@ def interpolated_times(crossings: Crossings) -> Float32:
     return np.where(crossings.at > 0, time, np.nan).astype(np.float32)
 
 
-def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32]:
+def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32, Float32]:
     """The time that each pixel tells alone, and how well it can.
 
     An edge that takes the part τ < 1 of a frame to pass is seen on its way by as many pixels. Of
@@ -140,8 +141,8 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
     is told by how little of the light is lost from one of the two frames to the other.
 
     Returns:
-        Positions among the frames and their standard deviations, in frames; (H, W) float32 each,
-        NaN and infinite where unknown.
+        Positions among the frames and their standard deviations, in frames, NaN and infinite where
+        unknown, and how many frames the edge takes to pass; (H, W) float32 each.
     """
     known = crossings.at > 0
     lost, left, passing, fall = (np.empty(known.shape, np.float32) for _ in range(4))
@@ -177,7 +178,7 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
         told = _told(crossings.part(rows), noise, caught, duration[rows])
         time[rows] = np.where(known[rows], told[0], np.float32(np.nan))
         error[rows] = np.where(known[rows], told[1], np.float32(np.inf))
-    return time, error
+    return time, error, duration
 
 
 def _extremes(
@@ -291,8 +292,7 @@ def usual_loss(contrast: Float32, highest: Float32, known: Bool, plane: Bool) ->
     """What part of its light each pixel loses to the stick, against what is usual on the plane.
 
     In shade of its own a pixel still loses some sky, at another time than it would lose the key
-    light: below `SHADE` it counts as shade. Where a stick blocks the key light only in part, the
-    middle of what is lost comes at another time than the edge: such times are to be trusted less.
+    light: below `SHADE` it counts as shade.
 
     Args:
         contrast, highest: (H, W), I_max - I_min and I_max.
@@ -310,6 +310,24 @@ def usual_loss(contrast: Float32, highest: Float32, known: Bool, plane: Bool) ->
     middle = float(np.median(usual[:: max(1, usual.size // _USUAL)]))
     part /= np.float32(max(middle, 1e-6))
     return np.minimum(part, 1, out=part)
+
+
+def misled(duration: Float32, loss: Float32) -> Float32:
+    """How far off a time may be because not all that is lost is the key light's.
+
+    A surface that the key light grazes, or that a stick blocks in part, loses as much of the sky as
+    others. While the edge passes that shifts the middle of what is lost, and alike for all pixels
+    around.
+
+    Args:
+        duration: (H, W), frames that the edge takes to pass, as of `own_times`.
+        loss: (H, W) as of `usual_loss`.
+
+    Returns:
+        (H, W) float32, frames; 0 where the loss is the usual one.
+    """
+    besides = 1 / np.maximum(loss, np.float32(SHADE)) - 1
+    return np.asarray(np.float32(_MISLED) * duration * besides, np.float32)
 
 
 def _counts(part: Float32, known: Bool) -> NDArray[np.float32]:

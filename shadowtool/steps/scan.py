@@ -28,6 +28,7 @@ from shadowtool.core.shadow_time import (
     SHADE,
     ShadowTimes,
     luminance_halfs,
+    misled,
     own_times,
     refined_times,
     significant,
@@ -260,12 +261,13 @@ def _times(
 ) -> tuple[ShadowTimes, float]:
     """Times and errors, each pixel's own and as its neighbours tell them too; and by what factor
     errors are larger than noise makes them."""
-    own, own_error = own_times(crossings, noise)
+    own, own_error, duration = own_times(crossings, noise)
     contrast = np.nan_to_num(crossings.highest - crossings.lowest)
     loss = usual_loss(contrast, crossings.highest, crossings.at > 0, region)
     in_shade = loss < SHADE
     own[in_shade], own_error[in_shade] = np.nan, np.inf
-    own_error /= np.maximum(loss, SHADE) ** 2
+    off = misled(duration, loss)
+    np.hypot(own_error, off, out=own_error)
     if (holes := _holes(numbers)).any():
         in_hole = np.append(False, holes)[crossings.at]
         own[in_hole], own_error[in_hole] = np.nan, np.inf
@@ -281,6 +283,8 @@ def _times(
 
     for _ in ordered_map(refine, overlapping_bands(len(own), windows.reach), jobs):
         pass
+    # Neighbours are misled alike: it does not average out.
+    np.hypot(error, off, out=error)
     if (np.diff(numbers) != 1).any():
         # From positions among the frames to frame numbers, which are not one apart.
         spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))

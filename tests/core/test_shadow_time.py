@@ -8,6 +8,7 @@ from shadowtool.core.shadow_time import (
     SHADE,
     interpolated_times,
     luminance,
+    misled,
     own_times,
     refined_times,
     significant,
@@ -110,7 +111,7 @@ SHARP = Sweep(0.4, speed=9.0, soft=1.0, width=30.0)
 def test_an_edge_sharper_than_its_step_is_told_by_those_that_caught_it(angle: float) -> None:
     sweep = Sweep(angle, speed=9.0, soft=1.0, width=30.0)
     crossings = crossings_of(sweep_frames(sweep, 0.003))
-    own, error = own_times(crossings, NOISE)
+    own, error, _ = own_times(crossings, NOISE)
     refined, spread = refined_times(own, error, crossings.at)
     interpolated = interpolated_times(crossings)
     off = {
@@ -132,7 +133,7 @@ def test_an_edge_sharper_than_its_step_is_told_by_those_that_caught_it(angle: fl
 def test_predicted_errors_hold_for_edges_of_any_width(soft: float) -> None:
     sweep = Sweep(0.4, speed=6.0, soft=soft, width=40.0)
     crossings = crossings_of(sweep_frames(sweep, 0.003))
-    own, error = own_times(crossings, NOISE)
+    own, error, _ = own_times(crossings, NOISE)
     known = np.isfinite(own) & SCENE.plane
     assert known.mean() > 0.7
     deviation = np.abs(own - true_times(sweep))[known] / error[known]
@@ -141,7 +142,7 @@ def test_predicted_errors_hold_for_edges_of_any_width(soft: float) -> None:
 
 def test_own_times_lie_between_their_frames() -> None:
     crossings = crossings_of(sweep_frames(SHARP, 0.01))
-    own, error = own_times(crossings, NOISE)
+    own, error, _ = own_times(crossings, NOISE)
     known = crossings.at > 0
     assert np.array_equal(np.isfinite(own), known) and np.array_equal(np.isfinite(error), known)
     assert (own[known] <= crossings.at[known]).all()
@@ -177,3 +178,28 @@ def test_what_loses_only_sky_to_the_stick_is_told_from_what_loses_the_key_light(
     assert loss[3] == pytest.approx(0.5)
     assert (loss[4:] == 1).all()
     assert (usual_loss(contrast, highest, known, ~known) == 1).all()
+
+
+@pytest.mark.parametrize("key", [0.8, 0.4, 0.2])
+def test_what_a_grazed_surface_loses_of_the_sky_is_in_its_error(key: float) -> None:
+    """The sky goes from 0.2 to 0.1, most of it before the edge or after it."""
+    rng = np.random.default_rng(0)
+    passes = rng.uniform(15, 25, (40, 40)).astype(np.float32)
+    early = rng.uniform(-12, 12, passes.shape).astype(np.float32)
+    finder = CrossingFinder()
+    for frame in range(40):
+        edge = np.clip((frame - passes) / 2 + 0.5, 0, 1)
+        sky = np.clip((frame - passes - early) / 30 + 0.5, 0, 1)
+        gray = 0.2 - 0.1 * sky + key * (1 - edge)
+        finder.add((gray + rng.normal(0, 0.001, gray.shape)).astype(np.float32))
+    found = significant(finder.found(), NOISE)
+    own, error, duration = own_times(found, NOISE)
+    loss = (found.highest - found.lowest) / found.highest / 0.9
+    known = np.isfinite(own)
+    assert known.mean() > 0.99
+    off = np.abs(own - passes)[known]
+    assert np.percentile(off / np.hypot(error, misled(duration, loss))[known], 90) < 3
+    assert (misled(duration, np.ones_like(loss)) == 0).all()
+    # Noise alone does not explain it.
+    if key == 0.2:
+        assert np.percentile(off / error[known], 90) > 4

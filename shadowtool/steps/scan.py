@@ -69,8 +69,9 @@ _BENT, _CERTAIN = 1.0, 6.0
 _FEW_DIGITS = 2**20
 # A sweep reaches little of the frame, and is fast: a part of the frame, pixels a frame.
 _LITTLE, _FAST = 0.5, 20.0
-# Times differ by so many times what noise explains only if something is wrong.
-_TREMBLING = 2.0
+# Times differ by so many times what noise explains only if something is wrong; and by so many,
+# with less than this part of the edges on lines, only if what moved is no straight shadow.
+_TREMBLING, _NO_SWEEP, _ON_LINES = 2.0, 4.0, 0.6
 # Between frames so many times further apart than usual the shadow passes more than can be told.
 _HOLE = 3.0
 # If more of the frame than this can't be told from one reading, the frames are read again.
@@ -96,7 +97,7 @@ def scan(
     Raises:
         InputError: frames or mask are missing or don't fit.
         OptionError: the polygon can't be read.
-        ReshootError: the plane shows too little of the sweep.
+        ReshootError: the plane shows too little of the sweep, or something that is none.
     """
     footage = open_footage(source, "frames", transfer, run.missing)
     say_assumed(footage, transfer)
@@ -144,6 +145,13 @@ def scan(
             f"{footage.sequence.pattern}: reshoot: {error}; sweep the shadow across the plane,"
             " or mark a larger plane"
         ) from None
+    on_lines = int(lines.points.sum()) / sum(map(len, points.values()))
+    if raised > _NO_SWEEP and on_lines < _ON_LINES:
+        raise ReshootError(
+            f"{footage.sequence.pattern}: reshoot: of what moves over the plane only"
+            f" {100 * on_lines:.0f}% lies on straight lines; sweep a straight stick's shadow"
+            " across it, and keep the camera and all else still"
+        )
     bend = line_bend(points, numbers, lines, footage.header.size)
     figures = _figures(times, lines, gains, bend) | {"errors_raised": round(raised, 2)}
     _advise(figures, footage.sequence.pattern)

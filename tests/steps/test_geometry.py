@@ -250,3 +250,18 @@ def test_a_camera_that_trembles_is_told_by_times_that_differ_by_more_than_noise(
     steady, trembling = (figures["errors_raised"] for figures in raised)
     assert steady < 1.1
     assert trembling > 1.3 * steady
+
+
+def test_a_take_that_is_no_sweep_is_to_be_shot_again(tmp_path: Path, mask: str) -> None:
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    figure = np.random.default_rng(0).uniform(0, 0.6, (50, 14, 3))
+    for frame in range(50):
+        left, top = 2 * frame, 25 + round(6 * np.sin(frame / 2))
+        image = SCENE.image(SCENE.disk(left + 30, 60 + 8 * np.sin(frame / 3), 16.0))
+        image[top : top + 50, left : left + 14] = figure
+        path = folder / f"walk.{1001 + frame}.exr"
+        write_exr(path, {"RGB": to_half(SCENE.noisy(image, frame))})
+    with pytest.raises(ReshootError, match=r"reshoot: of what moves .* only \d+% lies on straight"):
+        scan(folder, tmp_path / "scan", plane=mask)
+    assert not (tmp_path / "scan").exists()

@@ -332,29 +332,33 @@ def _most_probable(
         level = 1 / np.maximum(alpha, np.float32(0.05)) ** 2
         # β and light are eliminated from the normal equations.
         ground, light = weight * shift, weight * shading
-        ground_ground = (ground * shift).sum(axis=0) + even
-        light_light = (light * shading).sum(axis=0) + level
+        ground_ground, light_light = (ground * shift).sum(axis=0), (light * shading).sum(axis=0)
         ground_light = (ground * shading).sum(axis=0)
-        minor = ground_ground * light_light - ground_light**2
+        # But for rounding, what cancels out leaves nothing negative; so below.
+        minor = np.maximum(ground_ground * light_light - ground_light**2, 0)
+        ground_ground += even
+        minor += level * ground_ground + even * light_light
+        light_light += level
         sides = np.stack([(ground * contrast).sum(axis=0), (ground * above).sum(axis=0)])
         lit_sides = np.stack([(light * contrast).sum(axis=0), (light * above).sum(axis=0)])
         betas = (light_light * sides - ground_light * lit_sides) / minor
         lights = (ground_ground * lit_sides - ground_light * sides) / minor
         left = weight * (contrast - betas[0] * shift - lights[0] * shading)
-        information = (left * contrast).sum(axis=0) + trust
+        information = np.maximum((left * contrast).sum(axis=0), 0) + trust
         alpha = ((left * above).sum(axis=0) + trust * mean) / information
         alpha = np.clip(alpha, 0, 1)
     beta, lit = (parts[1] - alpha * parts[0] for parts in (betas, lights))
     rest = above - alpha * contrast - beta * shift - lit * shading
     misfit = (weight * rest**2).sum(axis=0) + even * beta**2 + level * lit**2
     likelihood = misfit + np.log(variance).sum(axis=0) + trust * (alpha - mean) ** 2
-    likelihood += np.log(minor * information / (even * level * trust))
+    # Of the logarithms, as the product may be too large for a single float.
+    likelihood += np.log(minor) + np.log(information) - np.log(even * level * trust)
     likelihood = -likelihood / 2 - pixels.far
     share = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
     share /= share.sum(axis=1, keepdims=True)
     average = (share * alpha).sum(axis=1)
     spread = (share * (alpha**2 + 1 / information)).sum(axis=1) - average**2
-    return average, np.sqrt(np.maximum(spread, 0)), misfit.min(axis=1), share
+    return np.minimum(average, 1), np.sqrt(np.maximum(spread, 0)), misfit.min(axis=1), share
 
 
 def _colour_variance(figure: Float32) -> Float32:

@@ -2,7 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
+from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.known_background import colours, ground_beta, measure, solve
+from shadowtool.core.noise import NoiseModel
 from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN, Prior
 from tests.figures import BACKDROP, BLUE, COLUMNS, KNOWN, NOISE, ROWS, SCENE, Shot, disk, shot
 
@@ -183,3 +185,25 @@ def test_ground_goes_on_behind_the_figure() -> None:
     assert np.array_equal(found[ground], SHADE[ground])
     assert found.max() <= 1
     assert (ground_beta(SHADE, np.zeros_like(ground)) == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_light_of_any_strength_gives_a_matte(seed: int) -> None:
+    """Sparks and dead pixels among dark ones, with hardly any noise."""
+    rng = np.random.default_rng(seed)
+
+    def sparks() -> np.ndarray:
+        strength = 10 ** rng.uniform(-4, 4, (*DISK.shape, 1)) * rng.choice([-0.1, 0, 1, 1])
+        return (strength * rng.uniform(0.3, 1, (*DISK.shape, 3))).astype(np.float32)
+
+    noise = NoiseModel(np.zeros(3), np.full(3, 4e-8))
+    backdrop = Backdrop(sparks(), sparks(), noise, BACKDROP.doubt)
+    image, trimap = sparks(), trimap_of(DISK, 3)
+    ground = ground_beta(backdrop.nearest(image).beta, trimap == BACKGROUND)
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        found = measure(image, trimap, ground, backdrop)
+        solved = solve(image, trimap, ground, backdrop, REACH, OPEN)
+    assert np.isfinite(found.error).all()
+    for alpha in (found.alpha, solved.alpha):
+        assert ((alpha >= 0) & (alpha <= 1)).all()
+    assert np.isfinite(solved.foreground).all()

@@ -113,9 +113,13 @@ class RunningGain:
             self._first = self._last = gray
             return 1.0
         changes = _ratios(gray, self._last)
-        if changes.size < _LEAST_PIXELS:
+        if not changes.size:
             return self._gain()
         middle = _median(changes)
+        # Of a picture that a shadow leaves all but black nothing can be told.
+        agreed = np.count_nonzero(np.abs(changes - middle) < _NEAR[0])
+        if agreed < max(_LEAST_PART * gray.size, _LEAST_PIXELS):
+            return self._gain()
         spread = 1.48 * _median(np.abs(changes - middle))
         expected = self._logarithm + _closed_in(changes, middle, spread)
         ratios = _ratios(gray, self._first)

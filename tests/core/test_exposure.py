@@ -166,10 +166,20 @@ def test_exposure_is_followed_past_a_sweep(loss: float, width: float) -> None:
     assert found == pytest.approx(gains, rel=0.011)
 
 
-@pytest.mark.parametrize(("loss", "width"), [(0.8, 12), (0.8, 400), (0.15, 400), (0.3, 40)])
+@pytest.mark.parametrize(
+    ("loss", "width"), [(0.8, 12), (0.8, 400), (0.15, 400), (0.3, 40), (0.99, 400), (1.0, 400)]
+)
 def test_under_steady_light_a_sweep_has_no_gain(loss: float, width: float) -> None:
     running = RunningGain()
     assert {running.add(gray) for gray in sweep(80, loss, width, np.ones(80))} == {1.0}
+
+
+@pytest.mark.parametrize("jump", [0.4, 0.8, 1.6, 3.0])
+def test_light_that_jumps_is_followed(jump: float) -> None:
+    gains = np.where(np.arange(80) < 33, 1.0, jump)
+    running = RunningGain()
+    found = [running.add(gray) for gray in sweep(80, 0.8, 60, gains)]
+    assert found == pytest.approx(gains, rel=0.011)
 
 
 def test_a_frame_that_is_no_picture_of_the_scene_leaves_the_gain() -> None:

@@ -122,12 +122,17 @@ def interpolated_times(crossings: Crossings) -> Float32:
     Returns:
         (H, W) float32, positions among the frames; NaN unknown.
     """
+    with np.errstate(invalid="ignore", over="ignore"):
+        time = _passed(crossings, (crossings.lowest + crossings.highest) / 2)
+    return np.where(crossings.at > 0, time, np.nan).astype(np.float32)
+
+
+def _passed(crossings: Crossings, threshold: NDArray[np.floating]) -> Float32:
+    """When a straight line from the frame before the crossing to the next is at a threshold."""
     before, after = crossings.before, crossings.after
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        threshold = (crossings.lowest + crossings.highest) / 2
         part = (before - threshold) / (before - after)
-    time = crossings.at - 1 + np.clip(part, 0, 1)
-    return np.where(crossings.at > 0, time, np.nan).astype(np.float32)
+    return np.asarray(crossings.at - 1 + np.clip(part, 0, 1), np.float32)
 
 
 def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32, Float32]:
@@ -209,7 +214,7 @@ def _told(
         duration: frames that the edge takes to pass, around each pixel.
     """
     lost, left = caught
-    _, _, _, lit_sigma, dark_sigma = _extremes(crossings, noise)
+    lit, dark, _, lit_sigma, dark_sigma = _extremes(crossings, noise)
     sharp = np.minimum(duration, 1)
     half, one = np.float32(0.5), np.float32(1)
     # Midway between the frames, unless one of them caught it.
@@ -224,7 +229,8 @@ def _told(
         spread = sharp * np.sqrt(sigma * sigma + np.float32(_PROFILE**2)) + np.float32(_LEAST_ERROR)
         cv2.copyTo(at, alone, time)
         cv2.copyTo(spread, alone, error)
-    straight = interpolated_times(crossings)
+    # Midway between what was lit and what was dark, not between the extremes of their noise.
+    straight = _passed(crossings, (lit + dark) / 2)
     scatter = np.sqrt(lit_sigma * lit_sigma + dark_sigma * dark_sigma) / 2
     soft = np.clip((duration - _SHARP) / (_SOFT - _SHARP), 0, 1)
     np.maximum(soft, both, out=soft)

@@ -18,6 +18,7 @@ from tests.scene import Scene, Sweep
 
 SCENE = Scene()
 NOISE = NoiseModel(np.full(3, 4.5e-5), np.full(3, 1e-6))
+NOISE_OF_12 = NoiseModel(np.full(3, 16 * 4.5e-5), np.full(3, 1e-6))
 
 
 def crossings_of(frames: list[np.ndarray]) -> Crossings:
@@ -138,6 +139,15 @@ def test_predicted_errors_hold_for_edges_of_any_width(soft: float) -> None:
     assert known.mean() > 0.7
     deviation = np.abs(own - true_times(sweep))[known] / error[known]
     assert np.percentile(deviation, 90) < 3
+
+
+def test_noise_does_not_move_the_middle_of_a_soft_edge() -> None:
+    sweep = Sweep(0.4, speed=2.0, soft=16.0, width=50.0)
+    own, *_ = own_times(crossings_of(sweep_frames(sweep, 0.012)), NOISE_OF_12)
+    off = (own - true_times(sweep))[SCENE.plane]
+    assert abs(np.nanmedian(off)) < 0.1
+    paper = paper_times(sweep_frames(sweep, 0.012)) - true_times(sweep)
+    assert abs(np.nanmedian(paper[SCENE.plane])) > 0.15
 
 
 def test_own_times_lie_between_their_frames() -> None:

@@ -202,6 +202,8 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
     for pair in pairs:
         first, second = (image.reshape(-1, 3) for image in pair)
         usable = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+        # What is clipped to black in both frames has no noise left.
+        usable &= (np.maximum(first, second) > 0).any(axis=1)
         if usable.sum() < 4 * _LEVELS:
             continue
         # By the brighter of the two: a pixel that the shadow covers in one of them alone, which

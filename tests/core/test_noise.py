@@ -71,6 +71,17 @@ def test_eight_bits_are_not_taken_for_a_codec_that_freezes() -> None:
     assert model_of(shots).sigma(np.full(3, 0.18)) == pytest.approx([true] * 3, rel=0.25)
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.0])
+def test_a_black_shadow_is_not_taken_for_a_codec_that_freezes(noise: float) -> None:
+    shots = []
+    for number, (clean, shot) in enumerate(zip(take(1) * 24, take(24), strict=True)):
+        image = clean + noise * (shot - clean)
+        image[:, : 7 * number] = 0
+        shots.append(decode_srgb(np.round(encode_srgb(np.maximum(image, 0)) * 255) / 255))
+    true = max(noise * np.sqrt(SLOPE * 0.18 + FLOOR), 1e-3)
+    assert (model_of(shots).sigma(np.full(3, 0.18)) < 1.6 * true).all()
+
+
 def test_noise_that_a_codec_makes_rare_and_large_is_as_large_as_it_is_far_off() -> None:
     rng = np.random.default_rng(3)
     texture = cv2.GaussianBlur(rng.normal(size=(240, 320, 3)), (0, 0), 2)

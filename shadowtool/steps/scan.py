@@ -71,7 +71,7 @@ _FEW_DIGITS = 2**20
 _LITTLE, _FAST = 0.5, 20.0
 # Times differ by so many times what noise explains only if something is wrong; and by so many,
 # with less than this part of the edges on lines, only if what moved is no straight shadow.
-_TREMBLING, _NO_SWEEP, _ON_LINES = 2.0, 4.0, 0.6
+_TREMBLING, _NO_SWEEP, _ON_LINES = 2.0, 4.0, 0.5
 # Between frames so many times further apart than usual the shadow passes more than can be told.
 _HOLE = 3.0
 # If more of the frame than this can't be told from one reading, the frames are read again.

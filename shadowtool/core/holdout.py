@@ -26,6 +26,9 @@ _COLUMNS = 320
 # A sample lies on a line within this many standard deviations, of its noise and this part of its
 # value together.
 _ON_LINE, _TOLERANCE = 4.0, 0.01
+# Between these logarithms of S/L shadow is looked for, on ground that is so many times as bright as
+# its noise. It is black if so many times as many samples are as have any one ratio.
+_DEEPEST, _LIGHTEST, _CLEAR, _BLACK = 4.0, -0.25, 8.0, 2.0
 # A take whose shadow darkens more of the picture than this is that of a card waved over a scene.
 _MOST, _SHADED, _AT_ONCE = 0.5, 0.5, 0.2
 # Candidates for L are every so many of a pixel's samples, dark to bright.
@@ -80,7 +83,7 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background | N
     stack = np.nan_to_num(stack, copy=False, nan=0.0, posinf=1e4, neginf=0.0)
     weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
     ascending = np.argsort(stack.sum(axis=1), axis=0)
-    ratio = _common_ratio(stack, ascending)[:, None]
+    ratio = _common_ratio(stack, ascending, noise)[:, None]
     lit = _most_supported(stack, ascending, weighed, ratio)
     shadow = lit * ratio
     on_line = [_on_line(sample, lit, shadow) for sample in weighed]
@@ -131,25 +134,39 @@ def _ranked(stack: Float32, order: Index, pixels: Index) -> Float32:
     return np.ascontiguousarray(stack[order[pixels], :, pixels].T)
 
 
-def _common_ratio(stack: Float32, ascending: Index) -> Float32:
-    """S/L, (3,): the most frequent ratio below 1 between a pixel's samples and a brighter one.
+def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float32:
+    """S/L, (3,): the ratio below 1 between a pixel's samples and a brighter one that is much more
+    frequent than those a little above and below.
 
-    Shadow keeps the ground's texture, so its ratio is the same everywhere; a figure's is not.
+    Shadow keeps the ground's texture, so its ratio is the same everywhere; a figure's is not, and
+    in a penumbra all ratios occur. Of a shadow that is all but black noise leaves no ratio, but
+    then more samples are black than have any one.
     """
     everywhere = np.arange(stack.shape[2])
     bright = _ranked(stack, ascending[int(0.85 * (len(stack) - 1))], everywhere)
-    gray = np.log(np.maximum(stack.sum(axis=1), 1e-4))
-    difference = gray - np.log(np.maximum(bright.sum(axis=0), 1e-4))
-    dark = difference[(difference > -4) & (difference < -0.25)]
-    if dark.size < 20:
+    light = bright.sum(axis=0)
+    clear = light > _CLEAR * noise.sigma(bright.T).sum(axis=1)
+    part = stack.sum(axis=1) / np.where(clear, np.maximum(light, 1e-4), 1)
+    difference = np.where(clear, np.log(np.maximum(part, 1e-4)), 1)
+    # Beyond what is looked for, too: it is next to some of that.
+    counts, edges = np.histogram(difference, bins=170, range=(-_DEEPEST, 0.25))
+    shades = edges[1:] < _LIGHTEST
+    excess = _smoothed(counts, 11) - _smoothed(counts, 45)
+    peak = int(np.argmax(excess[shades]))
+    alike = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2) < 0.1
+    black = difference <= -_DEEPEST
+    if black.sum() > _BLACK * alike.sum():
+        alike = black
+    elif counts[shades].sum() < 20:
         return np.full(3, 0.25, np.float32)
-    counts, edges = np.histogram(dark, bins=150, range=(-4, -0.25))
-    smooth = np.convolve(counts, np.hanning(11), mode="same")
-    peak = int(np.argmax(smooth))
-    centre = (edges[peak] + edges[peak + 1]) / 2
-    time, pixel = np.nonzero(np.abs(difference - centre) < 0.1)
-    ratios = stack[time, :, pixel] / np.maximum(bright[:, pixel].T, 1e-4)
-    return np.asarray(np.clip(np.median(ratios, axis=0), 0.01, 0.9), np.float32)
+    time, pixel = np.nonzero(alike)
+    ratios = stack[time, :, pixel] / bright[:, pixel].T
+    return np.asarray(np.clip(np.median(ratios, axis=0), 0, 0.9), np.float32)
+
+
+def _smoothed(counts: NDArray[np.integer], bins: int) -> NDArray[np.float64]:
+    window = np.hanning(bins)
+    return np.convolve(counts, window / window.sum(), mode="same")
 
 
 def _most_supported(

@@ -61,11 +61,11 @@ def figure_colour(x: float, clothes: Clothes) -> np.ndarray:
     return colour * folds[..., None]
 
 
-def shadow_beta(x: float, reach: float = 34) -> np.ndarray:
+def shadow_beta(x: float, reach: float = 34, soft: float = 2) -> np.ndarray:
     """A slanting shadow that starts at the feet and gets softer with distance."""
     away = np.clip((ROWS - 88) / 40, 0, 1)
     distance = np.abs(COLUMNS - (x + reach * away)) - 11
-    beta = smoothstep(distance / (2 + 6 * away) + 0.5)
+    beta = smoothstep(distance / (soft + 6 * away) + 0.5)
     return np.where(ROWS > 88, beta, 1.0)
 
 
@@ -162,6 +162,32 @@ def test_the_lines_are_those_of_the_ground(name: str) -> None:
     assert np.mean(lit < 0.05) > 0.97
     shadow = np.abs(np.log(background.shadow / SCENE.shadow)).max(axis=-1)
     assert np.mean(shadow < 0.15) > 0.95
+
+
+@pytest.mark.parametrize(
+    ("soft", "sky"), [(2, 1.0), (16, 1.0), (20, 0.5), (2, 0.05), (2, 0.02), (2, 0.0), (12, 0.0)]
+)
+def test_shadow_is_background_however_soft_or_dark(soft: float, sky: float) -> None:
+    dark = SCENE.shadow * np.float32(sky)
+    frames, alphas, betas = [], [], []
+    for number in range(FRAMES):
+        x = steadily(number)
+        betas.append(shadow_beta(x, soft=soft))
+        alphas.append(figure_alpha(x))
+        image = dark + betas[-1][..., None] * (SCENE.lit - dark)
+        image += alphas[-1][..., None] * (figure_colour(x, MANY) - image)
+        frames.append(SCENE.noisy(image.astype(np.float32), number))
+    chosen = np.linspace(0, FRAMES - 1, SAMPLES).round().astype(int)
+    background = find_background([frames[i] for i in chosen], NOISE)
+    assert background is not None
+    assert np.median(np.abs(background.shadow - dark) / SCENE.lit) < 0.02
+    held = [figure_mask(frame, background) for frame in frames]
+    around = np.ones((15, 15), np.uint8)
+    away = [cv2.dilate((alpha > 0).astype(np.uint8), around) == 0 for alpha in alphas]
+    shade = [m[a & (b < 0.9)].mean() for m, a, b in zip(held, away, betas, strict=True)]
+    assert np.mean(shade) < 0.05
+    figure = [m[alpha > 0.5].mean() for m, alpha in zip(held, alphas, strict=True)]
+    assert np.mean(figure) > 0.97
 
 
 def test_a_take_without_a_figure_holds_nothing_out() -> None:

@@ -146,7 +146,7 @@ def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float3
     bright = _ranked(stack, ascending[int(0.85 * (len(stack) - 1))], everywhere)
     light = bright.sum(axis=0)
     clear = light > _CLEAR * noise.sigma(bright.T).sum(axis=1)
-    part = stack.sum(axis=1) / np.where(clear, np.maximum(light, 1e-4), 1)
+    part = stack.sum(axis=1) / np.where(clear, light, 1)
     difference = np.where(clear, np.log(np.maximum(part, 1e-4)), 1)
     # Beyond what is looked for, too: it is next to some of that.
     counts, edges = np.histogram(difference, bins=170, range=(-_DEEPEST, 0.25))

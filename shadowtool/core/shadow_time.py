@@ -50,8 +50,8 @@ _MOVED = 3.0
 # Half the widths of the windows in which times are taken for linear, pixels.
 _RADII = (2, 5)
 _WINDOWS = Windows(_RADII)
-# Less than this part of the usual loss of light is that of a pixel in shade. What else than the key
-# light is lost moves a time by up to so much of the edge's duration, for each part of the key's.
+# Less than this part of the usual loss of light is that of a pixel in shade. A pixel that loses the
+# part p has a time that is off by up to so much of the edge's duration, 1/p - 1 times.
 SHADE, _MISLED = 0.3, 0.2
 
 

@@ -111,17 +111,14 @@ class Image:
         Raises:
             InputError: there is no colour that could be meant.
         """
-        if set("RGB") <= self.layers.keys():
-            values = _joined([self.layers[name] for name in "RGB"])
-        else:
-            values = _three_channels(self.layers[self._colour_layer()])
+        apart = self._apart()
+        values = _joined(apart) if apart else _three_channels(self.layers[self._colour_layer()])
         return decode(values, resolve_transfer(transfer, self.path))
 
     def colours(self, transfer: str = "auto") -> tuple[NDArray[np.floating], ...]:
         """The three channels of `rgb`, (H, W) each."""
-        if set("RGB") <= self.layers.keys():
-            stored = [self.layers[name] for name in "RGB"]
-        else:
+        stored = self._apart()
+        if not stored:
             values = _three_channels(self.layers[self._colour_layer()])
             stored = [_one_channel(values, index) for index in range(3)]
         return tuple(decode(values, resolve_transfer(transfer, self.path)) for values in stored)
@@ -181,6 +178,11 @@ class Image:
             if layer in ("RGB", "RGBA") and len(name) == 1 and name in layer:
                 return _unit(_one_channel(values, layer.index(name)))
         raise InputError(f"{self.path}: has no channel {name}, only {', '.join(self.layers)}")
+
+    def _apart(self) -> list[NDArray[Any]]:
+        """R, G and B where each is a layer of its own."""
+        names = "RGB" if set("RGB") <= self.layers.keys() else ""
+        return [self.layers[name] for name in names]
 
     def _colour_layer(self) -> str:
         for name in ("RGB", "RGBA"):

@@ -211,10 +211,10 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
             if run.missing == "skip":
                 return None
             raise
-        light = footage.transfer
-        sample = thin(image.rgb(light)) if position in samples.values() else None
-        picture = display(image.rgb(light)) if position == 0 else None
-        gray = luminance_halfs(*image.colours(light))
+        transfer = footage.transfer
+        sample = thin(image.rgb(transfer)) if position in samples.values() else None
+        picture = display(image.rgb(transfer)) if position == 0 else None
+        gray = luminance_halfs(*image.colours(transfer))
         return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
 
     finder, exposure = CrossingFinder(), RunningGain()

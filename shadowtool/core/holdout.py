@@ -150,14 +150,14 @@ def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float3
     difference = np.where(clear, np.log(np.maximum(part, 1e-4)), 1)
     # Beyond what is looked for, too: it is next to some of that.
     counts, edges = np.histogram(difference, bins=170, range=(-_DEEPEST, 0.25))
-    shades = edges[1:] < _LIGHTEST
     excess = _smoothed(counts, 11) - _smoothed(counts, 45)
-    peak = int(np.argmax(excess[shades]))
+    excess[(counts == 0) | (edges[1:] >= _LIGHTEST)] = -np.inf
+    peak = int(np.argmax(excess))
     alike = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2) < 0.1
     black = difference <= -_DEEPEST
     if black.sum() > _BLACK * alike.sum():
         alike = black
-    elif counts[shades].sum() < 20:
+    if alike.sum() < 20:
         return np.full(3, 0.25, np.float32)
     time, pixel = np.nonzero(alike)
     ratios = stack[time, :, pixel] / bright[:, pixel].T

@@ -190,6 +190,19 @@ def test_shadow_is_background_however_soft_or_dark(soft: float, sky: float) -> N
     assert np.mean(figure) > 0.97
 
 
+@pytest.mark.parametrize("places", [1, 3, 30, 300])
+def test_what_a_few_pixels_lose_makes_no_common_ratio(places: int) -> None:
+    rng = np.random.default_rng(places)
+    frames = [SCENE.noisy(SCENE.lit, seed)[:60, :80] for seed in range(SAMPLES)]
+    for frame in frames[::2]:
+        dimmed = rng.integers(0, 60, places), rng.integers(0, 80, places)
+        frame[dimmed] *= rng.uniform(0.68, 0.77, (places, 1)).astype(np.float32)
+    background = find_background(frames, NOISE)
+    assert background is not None
+    ratio = background.shadow / background.lit
+    assert ((ratio > 0.2) & (ratio < 0.8)).all()
+
+
 def test_a_take_without_a_figure_holds_nothing_out() -> None:
     assert not any(mask.any() for mask in shoot("empty").masks)
 

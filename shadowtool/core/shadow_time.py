@@ -122,8 +122,7 @@ def interpolated_times(crossings: Crossings) -> Float32:
     Returns:
         (H, W) float32, positions among the frames; NaN unknown.
     """
-    with np.errstate(invalid="ignore", over="ignore"):
-        time = _passed(crossings, (crossings.lowest + crossings.highest) / 2)
+    time = _passed(crossings, (crossings.lowest + crossings.highest) / 2)
     return np.where(crossings.at > 0, time, np.nan).astype(np.float32)
 
 

@@ -26,6 +26,7 @@ bench: .venv/installed-bench
 
 # How fast the commands are beside OpenEXR alone and beside oiiotool; half an hour on two cores.
 bench-speed: .venv/installed-dev
+	$(BIN)/python -m compileall -q shadowtool
 	$(BIN)/python -m tests.benchmarks.speed
 
 # Two hundred kills and more, at random moments of every step.

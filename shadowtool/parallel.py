@@ -4,6 +4,7 @@ OpenEXR and OpenCV release the GIL while they decode and encode, so threads are 
 own threads are switched off in favour of ours.
 """
 
+import contextlib
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -22,6 +23,18 @@ def available_cpus() -> int:
     if granted.isascii() and granted.isdigit() and int(granted) > 0:
         return int(granted)
     return len(os.sched_getaffinity(0))
+
+
+@contextlib.contextmanager
+def meanwhile(work: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
+    """Do one thing on a thread of its own while the block does others.
+
+    The block is given a function that waits for the result, or raises what ``work`` raised. The
+    work is over when the block is left, however that happens.
+    """
+    cv2.setNumThreads(1)
+    with ThreadPoolExecutor(1, thread_name_prefix="shadowtool") as pool:
+        yield pool.submit(work).result
 
 
 def ordered_map(

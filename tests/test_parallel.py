@@ -6,7 +6,7 @@ import time
 import cv2
 import pytest
 
-from shadowtool.parallel import available_cpus, ordered_map
+from shadowtool.parallel import available_cpus, meanwhile, ordered_map
 
 
 def shadowtool_threads() -> list[str]:
@@ -167,3 +167,38 @@ def test_by_default_as_many_threads_as_cpus_are_used(monkeypatch):
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "3")
     meeting = threading.Barrier(3)
     assert len(list(ordered_map(lambda _: meeting.wait(timeout=5), range(3)))) == 3
+
+
+def test_work_goes_on_meanwhile_and_its_result_is_waited_for():
+    begun, asked = threading.Event(), threading.Event()
+
+    def work() -> int:
+        begun.set()
+        assert asked.wait(timeout=5)
+        return 7
+
+    with meanwhile(work) as result:
+        assert begun.wait(timeout=5)
+        asked.set()
+        assert result() == 7
+    assert not shadowtool_threads()
+
+
+def test_what_goes_wrong_meanwhile_is_raised_where_the_result_is_asked_for():
+    def work() -> int:
+        raise ValueError("in the work")
+
+    with meanwhile(work) as result, pytest.raises(ValueError, match="in the work"):
+        result()
+
+
+def test_work_is_over_when_the_block_fails():
+    over = []
+
+    def work() -> None:
+        time.sleep(0.05)
+        over.append(True)
+
+    with pytest.raises(ValueError, match="in the block"), meanwhile(work):
+        raise ValueError("in the block")
+    assert over

@@ -24,7 +24,7 @@ def bands(shape: tuple[int, ...], channels: int = 3) -> Iterator[slice]:
         yield slice(start, min(start + step, height))
 
 
-def overlapping_bands(height: int, reach: int, rows: int = 128) -> list[tuple[slice, slice]]:
+def overlapping_bands(height: int, reach: int, rows: int = 192) -> list[tuple[slice, slice]]:
     """Rows of a picture of which each result depends on others around it.
 
     Args:

@@ -104,12 +104,12 @@ def fit_planes(
     # A plane may deviate from the measurement by so much.
     allowed = np.where(trusted, _AGREES * np.sqrt(variance), np.inf).astype(np.float32)
     least, most = best - allowed, best + allowed
-    moments = np.empty((10, *value.shape))
+    moments = [np.empty(value.shape) for _ in range(10)]
     for radius in windows.radii:
         # A pixel's windows are centred up to a radius off it, and end at another.
         start, stop = max(first - 2 * radius, 0), last + 2 * radius
         own, heavy = measured[start:stop], weight[start:stop]
-        planes = _planes(own, heavy, radius, windows.factor, moments[:, : len(own)])
+        planes = _planes(own, heavy, radius, windows.factor, [part[: len(own)] for part in moments])
         for rows in bands(best.shape, channels=_ARRAYS):
             chosen = _Choice(*(part[rows] for part in (best, spread, least, most)))
             _choose(planes, radius, rows.start + first - start, chosen)
@@ -250,13 +250,13 @@ def _choose(planes: _Planes, radius: int, first: int, chosen: _Choice) -> None:
 
 
 def _planes(
-    value: Float64, weight: Float64, radius: int, factor: float, moments: Float64
+    value: Float64, weight: Float64, radius: int, factor: float, moments: list[Float64]
 ) -> _Planes:
     """The planes fitted to the windows around all pixels.
 
     Args:
         factor: by how much they are known worse than from independent measurements.
-        moments: (10, H, W), to work in.
+        moments: ten of (H, W), to work in.
     """
     sums = _sums_by_kernels if radius < _WIDE else _sums_by_steps
     weighted = weight * value
@@ -273,7 +273,7 @@ def _planes(
     return planes
 
 
-def _sums_by_kernels(image: Float64, radius: int, powers: Powers, sums: Float64) -> None:
+def _sums_by_kernels(image: Float64, radius: int, powers: Powers, sums: list[Float64]) -> None:
     """Sums of the image times xᵃyᵇ over the windows around all pixels, x and y counted from
     there."""
     ramp = np.arange(-radius, radius + 1, dtype=np.float64)
@@ -284,7 +284,7 @@ def _sums_by_kernels(image: Float64, radius: int, powers: Powers, sums: Float64)
         )
 
 
-def _sums_by_steps(image: Float64, radius: int, powers: Powers, sums: Float64) -> None:
+def _sums_by_steps(image: Float64, radius: int, powers: Powers, sums: list[Float64]) -> None:
     """The same in a time that does not grow with the radius: from window to window it is what
     enters that is added, and what leaves that is taken away."""
     height, width = image.shape

@@ -312,9 +312,11 @@ def _fit(points: Float64) -> _Line | None:
         normal = np.stack([-along[:, 1], along[:, 0]], axis=-1) / length[:, None]
         offset = -(one * normal).sum(axis=-1)
         judges = points[:: max(1, len(points) // _JUDGES)]
-        distance = judges @ normal.T + offset
+        far = judges @ normal.T + offset
+        far /= _NEAR
+        far *= far
         # Not a count with a sharp bound but how near the near ones are.
-        score = np.maximum(1 - (distance / _NEAR) ** 2, 0).sum(axis=0)
+        score = np.maximum(np.subtract(1, far, out=far), 0, out=far).sum(axis=0)
         best = int(np.argmax(score))
         points = points[np.abs(points @ normal[best] + offset[best]) <= _NEAR]
     if len(points) < _LEAST_POINTS:

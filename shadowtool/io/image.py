@@ -43,6 +43,8 @@ EXR, PNG = ".exr", ".png"
 _MOST_PIXELS = 1 << 28
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _ATTRIBUTE = "shadowtool."
+# Of a grey picture R, G and B differ by no more than this, which rounding explains.
+_COLOURED = 1 / 32
 # ZIP levels: the library's own, and the least that compresses.
 _USUAL, _QUICK = -1, 1
 # What OpenEXR raises for headers that make no sense; ZeroDivisionError is a rational number's.
@@ -146,10 +148,10 @@ class Image:
 
         Args:
             names: the channels to look for, first choice first; failing them a picture of a
-                single channel, or of three that stand for grey, gives it.
+                single channel, or R, G and B that stand for grey, give it.
 
         Raises:
-            InputError: no such channel.
+            InputError: no such channel, or R, G and B differ.
         """
         for name in names:
             with contextlib.suppress(InputError):
@@ -160,11 +162,22 @@ class Image:
         only = list(self.layers.values())
         if len(only) == 1 and only[0].ndim == 2:
             return _unit(only[0])
-        if len(only) == 1 and next(iter(self.layers)) == "RGB":
-            return _unit(_one_channel(only[0], 1))
+        for layer in ("RGB", "RGBA"):
+            if layer in self.layers:
+                return self._grey(self.layers[layer])
         raise InputError(
             f"{self.path}: has no channel {' or '.join(names)}, only {', '.join(self.layers)}"
         )
+
+    def _grey(self, values: NDArray[Any]) -> Float32:
+        red, green, blue = (_unit(_one_channel(values, index)) for index in range(3))
+        with np.errstate(invalid="ignore", over="ignore"):
+            coloured = any((np.abs(o - green) > _COLOURED).any() for o in (red, blue))
+        if coloured:
+            raise InputError(
+                f"{self.path}: is coloured; give one channel, an alpha, or a grey picture"
+            )
+        return green
 
     def channel(self, name: str) -> Float32:
         """One channel (H, W) as float32, by its exact name.
@@ -312,6 +325,24 @@ def write_exr(
     Raises:
         RetryError, ShadowtoolError: as `write_bytes`.
     """
+    write_bytes(path, encode_exr(path, channels, header, provenance, quick))
+
+
+def encode_exr(
+    path: Path,
+    channels: Mapping[str, NDArray[Any]],
+    header: Header | None = None,
+    provenance: Mapping[str, str] | None = None,
+    quick: bool = False,
+) -> memoryview:
+    """The bytes that `write_exr` writes.
+
+    Args:
+        path: what they are for, to be named if they can't be made.
+
+    Raises:
+        ShadowtoolError: they can't be made.
+    """
     arrays = {}
     for name, values in channels.items():
         if values.dtype not in (np.float16, np.float32):
@@ -339,7 +370,7 @@ def write_exr(
             OpenEXR.File(attributes, arrays).write(buffer)
     except RuntimeError as error:
         raise ShadowtoolError(f"{path}: cannot be encoded: {error}") from None
-    write_bytes(path, buffer.getbuffer())
+    return buffer.getbuffer()
 
 
 class _ZipLevel:

@@ -28,7 +28,7 @@ from shadowtool.core.warp_map import (
 )
 from shadowtool.errors import InputError
 from shadowtool.io.files import fingerprint, is_file, read_bytes, write_bytes
-from shadowtool.io.image import EXR, PNG, Header, Image, read_image, write_exr
+from shadowtool.io.image import EXR, PNG, Header, Image, encode_exr, read_image, write_exr
 
 MANIFEST = "shadowtool.json"
 LINES = "lines.json"
@@ -109,16 +109,35 @@ def confidence_layers(
     return layers
 
 
-def write_scan(folder: Path, scan: Pass, header: Header, provenance: Provenance) -> None:
-    """Write ``scan.exr`` and ``lines.json``.
+def encode_times(
+    folder: Path, times: ShadowTimes, header: Header, provenance: Provenance
+) -> memoryview:
+    """The bytes of the folder's ``scan.exr``, which take a while and don't depend on the lines.
 
     Of errors and contrast a half keeps all digits that say something; contrast stays a single
     float, as other programs expect it.
     """
-    layers = {part.name: getattr(scan.times, part.name) for part in fields(scan.times)}
+    layers = {part.name: getattr(times, part.name) for part in fields(times)}
     layers |= {name: rounded(layers[name]) for name in ("error", "own_error")}
-    layers["contrast"] = to_float(rounded(scan.times.contrast))
-    write_exr(folder / SCAN, layers, header, provenance, quick=True)
+    layers["contrast"] = to_float(rounded(times.contrast))
+    return encode_exr(folder / SCAN, layers, header, provenance, quick=True)
+
+
+def write_scan(
+    folder: Path,
+    scan: Pass,
+    header: Header,
+    provenance: Provenance,
+    encoded: memoryview | None = None,
+) -> None:
+    """Write ``scan.exr`` and ``lines.json``.
+
+    Args:
+        encoded: what `encode_times` made of the pass's times, if it was called before.
+    """
+    if encoded is None:
+        encoded = encode_times(folder, scan.times, header, provenance)
+    write_bytes(folder / SCAN, encoded)
     lines = scan.lines
     rows = [
         {

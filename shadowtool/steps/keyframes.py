@@ -107,7 +107,7 @@ class Keyframes:
 
 def trimap_of(path: Path) -> UInt8:
     """A trimap from a file, (H, W) uint8: what is nearly black or white, and the rest unknown."""
-    plane = np.nan_to_num(read_image(path).plane("Y", "G"))
+    plane = np.nan_to_num(read_image(path).plane("Y"))
     trimap = np.full(plane.shape, UNKNOWN, np.uint8)
     trimap[plane < 0.25] = BACKGROUND
     trimap[plane > 0.75] = FIGURE

@@ -425,7 +425,7 @@ def _figure_layers(figure: _Figure, shape: tuple[int, ...]) -> dict[str, NDArray
 
 def _matte_plane(path: Path) -> Float32:
     """Alpha from a file, (H, W) float32 in [0, 1]; 0 where it is NaN."""
-    plane = read_image(path).plane("A", "Y", "R")
+    plane = read_image(path).plane("A", "Y")
     # Of NaN and a number fmax takes the number.
     np.fmax(plane, 0, out=plane)
     return np.minimum(plane, 1, out=plane)

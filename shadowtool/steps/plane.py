@@ -51,7 +51,7 @@ def read_plane(plane: str, header: Header) -> Plane:
     else:
         image = read_image(Path(plane))
         require_size(image.path, image.header, header, "the footage")
-        region = (image.plane("A", "Y", "G") > 0.5).astype(np.uint8)
+        region = (image.plane("A", "Y") > 0.5).astype(np.uint8)
         name, mark = image.path.name, image.fingerprint
     if not region.any():
         raise OptionError(f"--plane {plane}: no pixel of the picture lies inside")

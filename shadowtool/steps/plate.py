@@ -329,7 +329,7 @@ class _Take:
                 if self.held is not None:
                     matte = self._given(self.held.path(frame))
                     marks.append(matte.fingerprint)
-                    holdout = matte.plane("A", "Y", "R")
+                    holdout = matte.plane("A", "Y")
                 elif self.background is not None:
                     holdout = self.automatic(frame, grid, last)
                     if last:

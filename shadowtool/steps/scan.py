@@ -39,9 +39,9 @@ from shadowtool.core.warp_map import Pass
 from shadowtool.errors import DamagedFileError, InputError, ReshootError
 from shadowtool.io.files import fingerprint_file, make_folder
 from shadowtool.io.image import write_png
-from shadowtool.io.products import LINES, MANIFEST, SCAN, write_scan
+from shadowtool.io.products import LINES, MANIFEST, SCAN, encode_times, write_scan
 from shadowtool.io.sequence import Frame
-from shadowtool.parallel import ordered_map
+from shadowtool.parallel import meanwhile, ordered_map
 from shadowtool.steps.footage import Footage, open_footage, say_assumed
 from shadowtool.steps.plane import read_plane
 from shadowtool.steps.run import (
@@ -137,38 +137,19 @@ def scan(
             used[before],
             used[before + 1],
         )
-    points = zero_crossings(times.time, region, numbers)
-    try:
-        lines = fit_shadow_lines(points, numbers)
-    except NoLinesError as error:
-        raise ReshootError(
-            f"{footage.sequence.pattern}: reshoot: {error}; sweep the shadow across the plane,"
-            " or mark a larger plane"
-        ) from None
-    on_lines = int(lines.points.sum()) / sum(map(len, points.values()))
-    if raised > _NO_SWEEP and on_lines < _ON_LINES:
-        raise ReshootError(
-            f"{footage.sequence.pattern}: reshoot: of what moves over the plane only"
-            f" {100 * on_lines:.0f}% lies on straight lines; sweep a straight stick's shadow"
-            " across it, and keep the camera and all else still"
-        )
-    bend = line_bend(points, numbers, lines, footage.header.size)
-    figures = _figures(times, lines, gains, bend) | {"errors_raised": round(raised, 2)}
-    _advise(figures, footage.sequence.pattern)
     mark = recipe.fingerprint([plane_mark, *marks])
     provenance = recipe.provenance(mark)
-    make_folder(output)
-
-    def draw() -> None:
+    with meanwhile(lambda: encode_times(output, times, footage.header, provenance)) as encoded:
+        points = zero_crossings(times.time, region, numbers)
+        lines = _lines(points, numbers, raised, footage.sequence.pattern)
+        bend = line_bend(points, numbers, lines, footage.header.size)
+        figures = _figures(times, lines, gains, bend) | {"errors_raised": round(raised, 2)}
+        _advise(figures, footage.sequence.pattern)
         picture = display(footage.read(used[0])) if first is None else first
         picture = time_picture(picture, times.time, lines, region)
+        make_folder(output)
         write_png(output / PICTURE, picture, provenance)
-
-    def write() -> None:
-        write_scan(output, Pass(times, lines), footage.header, provenance)
-
-    for _ in ordered_map(lambda make: make(), (write, draw), run.jobs):
-        pass
+        write_scan(output, Pass(times, lines), footage.header, provenance, encoded())
     write_manifest(output, recipe, mark, figures)
     return Result("scan", output, used, 0, skipped, figures)
 
@@ -236,8 +217,10 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
         run.progress(position + 1, len(frames))
     if len(gains) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
-    noise = noise_model(noise_levels(thinned))
-    crossings = significant(finder.found(), noise)
+    with meanwhile(lambda: noise_model(noise_levels(thinned))) as measured:
+        found = finder.found()
+    noise = measured()
+    crossings = significant(found, noise)
     if crossings.lost.mean() > _LOST:
         crossings = _looked_at_again(footage, crossings, gains, run)
     return _Reading(crossings, noise, marks, gains, bad, first)
@@ -315,6 +298,34 @@ def _numbers(clock: Float32, numbers: NDArray[np.float64]) -> Float32:
     if (np.diff(numbers) == 1).all():
         return clock + np.float32(numbers[0])
     return np.interp(clock, np.arange(len(numbers)), numbers).astype(np.float32)
+
+
+def _lines(
+    points: dict[int, NDArray[np.float64]], numbers: NDArray[np.float64], raised: float, take: str
+) -> ShadowLines:
+    """The pass's lines, if it is a sweep.
+
+    Args:
+        points: as of `zero_crossings`.
+        raised: by what factor errors are larger than noise makes them.
+
+    Raises:
+        ReshootError: the plane shows too little of the sweep, or something that is none.
+    """
+    try:
+        lines = fit_shadow_lines(points, numbers)
+    except NoLinesError as error:
+        raise ReshootError(
+            f"{take}: reshoot: {error}; sweep the shadow across the plane, or mark a larger plane"
+        ) from None
+    on_lines = int(lines.points.sum()) / sum(map(len, points.values()))
+    if raised > _NO_SWEEP and on_lines < _ON_LINES:
+        raise ReshootError(
+            f"{take}: reshoot: of what moves over the plane only {100 * on_lines:.0f}% lies on"
+            " straight lines; sweep a straight stick's shadow across it, and keep the camera and"
+            " all else still"
+        )
+    return lines
 
 
 def _advise(figures: Figures, take: str) -> None:

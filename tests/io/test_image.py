@@ -631,6 +631,26 @@ def test_a_plane_that_is_not_there_is_refused_with_the_others_named(tmp_path):
         read_image(tmp_path / "a.exr").plane("A", "Z")
 
 
+@pytest.mark.parametrize("opaque", [False, True])
+@pytest.mark.parametrize("suffix", ["exr", "png"])
+def test_grey_in_three_channels_is_a_plane_and_colour_is_none(suffix, opaque, tmp_path):
+    grey = np.repeat((random(4, 5) * 255).astype(np.uint8)[..., np.newaxis], 3, axis=-1)
+    coloured = grey.copy()
+    coloured[2, 3, 0] ^= 0x80
+    for name, values in (("grey", grey), ("coloured", coloured)):
+        if opaque:
+            values = np.dstack([values, np.full_like(values[..., 0], 255)])
+        path = tmp_path / f"{name}.{suffix}"
+        if suffix == "png":
+            write_png(path, values)
+        else:
+            write_exr(path, {"RGBA" if opaque else "RGB": (values / 255).astype(np.float32)})
+    found = read_image(tmp_path / f"grey.{suffix}").plane("A", "Y")
+    np.testing.assert_allclose(found, grey[..., 0] / 255, atol=1e-6)
+    with pytest.raises(InputError, match=rf"coloured\.{suffix}: is coloured; give one channel"):
+        read_image(tmp_path / f"coloured.{suffix}").plane("A", "Y")
+
+
 def test_integer_planes_are_scaled_and_not_decoded(tmp_path):
     write_png(tmp_path / "a.png", np.array([[0, 51, 255]], np.uint8))
     plane = read_image(tmp_path / "a.png").plane("Y")

@@ -140,15 +140,23 @@ def common_reference(samples: list[Float32]) -> Float32:
     Its own exposure is that of the most frames: where long shade pulls the median down, the light
     that most of them agree in lifts it again.
     """
-    reference = np.median(samples, axis=0)
+    reference = _middle(samples)
     gains = [frame_gain(sample, reference) for sample in samples]
     level = float(np.median(gains))
     corrected = [
         sample * np.float32(level / gain) for sample, gain in zip(samples, gains, strict=True)
     ]
-    reference = np.asarray(np.median(corrected, axis=0), np.float32)
+    reference = _middle(corrected)
     usual = float(np.median([frame_gain(sample, reference) for sample in samples]))
     return reference * np.float32(usual)
+
+
+def _middle(samples: list[Float32]) -> Float32:
+    """The median of pictures, pixel by pixel, NaN where one is; by a sort, several times faster
+    than numpy's own."""
+    ordered = np.sort(samples, axis=0)
+    middle = (ordered[(len(samples) - 1) // 2] + ordered[len(samples) // 2]) / np.float32(2)
+    return np.asarray(np.where(np.isnan(ordered[-1]), ordered[-1], middle), np.float32)
 
 
 def without_gain(image: NDArray[np.floating], gain: float) -> NDArray[np.floating]:

@@ -245,17 +245,30 @@ def _heaviness(pairs: list[tuple[Float32, Float32]], share: float, noise: NoiseM
         with np.errstate(invalid="ignore", over="ignore"):
             sigma = noise.sigma((first + second) / 2) * np.float32(np.sqrt(2))
             off = np.abs(first - second) / sigma
-        parts = (
-            tile.reshape(tile.shape[0] * tile.shape[1], 3)
-            for band in np.array_split(off, _TILES)
-            for tile in np.array_split(band, _TILES, axis=1)
-        )
-        tiles = [part[np.isfinite(part).all(axis=1)] for part in parts]
-        rare = [np.quantile(tile, _RARE[0], axis=0) for tile in tiles if len(tile) >= _LEVELS]
-        if rare:
+        rare = _quantile_in_tiles(off, _RARE[0])
+        if rare.size:
             found.append(np.median(rare, axis=0) / _RARE[1])
     times = np.quantile(found, share, axis=0) if found else np.ones(3)
     return np.where(times < _HEAVY, 1.0, times)
+
+
+def _quantile_in_tiles(off: Float32, part: float) -> Float64:
+    """A quantile of each channel of a picture (h, w, 3) in each tile, (T, 3). Pixels that are not
+    finite are left out, and tiles of few others."""
+    height, width = off.shape[:2]
+    rows, columns = (-(-size // _TILES) for size in (height, width))
+    whole = np.full((3, _TILES * rows, _TILES * columns), np.nan, np.float32)
+    whole[:, :height, :width] = np.moveaxis(off, -1, 0)
+    whole[:, ~np.isfinite(whole).all(axis=0)] = np.nan
+    tiles = whole.reshape(3, _TILES, rows, _TILES, columns).swapaxes(2, 3)
+    # NaN comes last.
+    ordered = np.sort(tiles.reshape(3, _TILES**2, rows * columns), axis=-1)
+    count = np.isfinite(ordered[0]).sum(axis=-1)
+    enough = np.flatnonzero(count >= _LEVELS)
+    place = part * (count[enough] - 1)
+    before = place.astype(int)
+    low, high = ordered[:, enough, before], ordered[:, enough, before + 1]
+    return np.asarray((low + (high - low) * (place - before)).T, np.float64)
 
 
 def _code_steps(values: Float32) -> Float32:

@@ -130,6 +130,8 @@ def scan(
             footage.sequence.pattern,
         )
     times, raised = _times(crossings, noise, region, numbers, run.jobs)
+    # The encoder wants the room.
+    del crossings
     for before in np.flatnonzero(_holes(numbers)):
         logger.warning(
             "%s: no frames between %s and %s; what the shadow passed meanwhile is unknown",
@@ -142,14 +144,18 @@ def scan(
     with meanwhile(lambda: encode_times(output, times, footage.header, provenance)) as encoded:
         points = zero_crossings(times.time, region, numbers)
         lines = _lines(points, numbers, raised, footage.sequence.pattern)
-        bend = line_bend(points, numbers, lines, footage.header.size)
-        figures = _figures(times, lines, gains, bend) | {"errors_raised": round(raised, 2)}
-        _advise(figures, footage.sequence.pattern)
-        picture = display(footage.read(used[0])) if first is None else first
-        picture = time_picture(picture, times.time, lines, region)
+
+        def draw() -> UInt8:
+            picture = display(footage.read(used[0])) if first is None else first
+            return time_picture(picture, times.time, lines, region)
+
         make_folder(output)
-        write_png(output / PICTURE, picture, provenance)
-        write_scan(output, Pass(times, lines), footage.header, provenance, encoded())
+        with meanwhile(lambda: write_png(output / PICTURE, draw(), provenance)) as drawn:
+            bend = line_bend(points, numbers, lines, footage.header.size)
+            figures = _figures(times, lines, gains, bend) | {"errors_raised": round(raised, 2)}
+            _advise(figures, footage.sequence.pattern)
+            write_scan(output, Pass(times, lines), footage.header, provenance, encoded())
+            drawn()
     write_manifest(output, recipe, mark, figures)
     return Result("scan", output, used, 0, skipped, figures)
 

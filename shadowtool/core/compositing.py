@@ -35,11 +35,13 @@ def over(foreground: Float32, alpha: Float32, background: Float32) -> Float32:
         background: (H, W, 3).
 
     Returns:
-        (H, W, 3) float32.
+        (H, W, 3) float32; NaN where the background is and the figure does not hide it.
     """
     result = np.empty_like(background)
     for rows in bands(alpha.shape):
-        np.multiply(1 - in_all_channels(alpha[rows]), background[rows], out=result[rows])
+        past = 1 - in_all_channels(alpha[rows])
+        np.multiply(past, background[rows], out=result[rows])
+        result[rows][past == 0] = 0
         result[rows] += foreground[rows]
     return result
 

@@ -148,36 +148,39 @@ class Image:
 
         Args:
             names: the channels to look for, first choice first; failing them a picture of a
-                single channel, or R, G and B that stand for grey, give it.
+                single channel, or R, G and B that stand for grey, give it. These come before an
+                alpha that is opaque everywhere.
 
         Raises:
             InputError: no such channel, or R, G and B differ.
         """
+        opaque: Float32 | None = None
         for name in names:
             with contextlib.suppress(InputError):
                 values = self.channel(name)
                 # Paint programs add an opaque alpha, which says nothing of what was painted.
-                if name != "A" or len(names) == 1 or np.ptp(values) > 0 or values.shape == (1, 1):
+                if name != "A" or not (values >= 1).all():
                     return values
+                opaque = values
         only = list(self.layers.values())
         if len(only) == 1 and only[0].ndim == 2:
             return _unit(only[0])
+        coloured = False
         for layer in ("RGB", "RGBA"):
             if layer in self.layers:
-                return self._grey(self.layers[layer])
-        raise InputError(
-            f"{self.path}: has no channel {' or '.join(names)}, only {', '.join(self.layers)}"
-        )
-
-    def _grey(self, values: NDArray[Any]) -> Float32:
-        red, green, blue = (_unit(_one_channel(values, index)) for index in range(3))
-        with np.errstate(invalid="ignore", over="ignore"):
-            coloured = any((np.abs(o - green) > _COLOURED).any() for o in (red, blue))
+                grey = _grey(self.layers[layer])
+                if grey is not None:
+                    return grey
+                coloured = True
+        if opaque is not None:
+            return opaque
         if coloured:
             raise InputError(
                 f"{self.path}: is coloured; give one channel, an alpha, or a grey picture"
             )
-        return green
+        raise InputError(
+            f"{self.path}: has no channel {' or '.join(names)}, only {', '.join(self.layers)}"
+        )
 
     def channel(self, name: str) -> Float32:
         """One channel (H, W) as float32, by its exact name.
@@ -256,6 +259,14 @@ def _joined(channels: Sequence[NDArray[Any]]) -> NDArray[Any]:
 def _one_channel(values: NDArray[Any], index: int) -> NDArray[Any]:
     """(H, W) of (H, W, C)."""
     return cv2.extractChannel(_for_opencv(values), index).view(values.dtype)
+
+
+def _grey(values: NDArray[Any]) -> Float32 | None:
+    """(H, W) of (H, W, 3) or (H, W, 4) whose first three channels are alike, else None."""
+    red, green, blue = (_unit(_one_channel(values, index)) for index in range(3))
+    with np.errstate(invalid="ignore", over="ignore"):
+        coloured = any((np.abs(other - green) > _COLOURED).any() for other in (red, blue))
+    return None if coloured else green
 
 
 def _for_opencv(values: NDArray[Any]) -> NDArray[Any]:

@@ -20,6 +20,9 @@ from shadowtool.steps.footage import Footage, require_frames
 
 UInt8 = NDArray[np.uint8]
 
+# What is nearly black or white in a trimap. Grey stays grey, 0.21, if a program has taken it for
+# sRGB-encoded and made it linear.
+_BLACK, _WHITE = 0.1, 0.9
 # From further away nothing comes through, and no more links are kept for the next frames.
 _FURTHEST = 24
 
@@ -109,6 +112,6 @@ def trimap_of(path: Path) -> UInt8:
     """A trimap from a file, (H, W) uint8: what is nearly black or white, and the rest unknown."""
     plane = np.nan_to_num(read_image(path).plane("Y"))
     trimap = np.full(plane.shape, UNKNOWN, np.uint8)
-    trimap[plane < 0.25] = BACKGROUND
-    trimap[plane > 0.75] = FIGURE
+    trimap[plane < _BLACK] = BACKGROUND
+    trimap[plane > _WHITE] = FIGURE
     return trimap

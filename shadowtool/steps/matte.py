@@ -146,7 +146,7 @@ def matte(
         gain,
         output,
     )
-    shared = [stored.fingerprint]
+    shared = [stored.fingerprint, *given]
     # Plates in which something is unknown are not kept beside those that it was taken out of.
     del stored
     work = FrameWork(recipe, output, take.products, take.sources, shared, take.make)

@@ -20,6 +20,9 @@ from shadowtool.parallel import ordered_map
 
 logger = logging.getLogger(__name__)
 
+# Flags that are on unless they are switched off by a --no- of their own.
+_SWITCHES = {"clamp"}
+
 Progress = Callable[[int, int], None]
 Figures = dict[str, Any]
 
@@ -72,7 +75,7 @@ class Recipe:
             words += [name.split()[0], value] if name.startswith("--") else [value]
         for name, value in self.parameters.items():
             if isinstance(value, bool):
-                words.append(f"--{name}" if value else f"--no-{name}")
+                words += [f"--{name}"] if value else [f"--no-{name}"] * (name in _SWITCHES)
             elif isinstance(value, (str, int, float)):
                 words += [f"--{name}", str(value)]
         return shlex.join(words)

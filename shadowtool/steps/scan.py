@@ -115,7 +115,8 @@ def scan(
     refuse_other_step("scan", output, run)
     if run.resume:
         paths = [footage.sequence.path(frame) for frame in frames]
-        mark = recipe.fingerprint([plane_mark, *ordered_map(fingerprint_file, paths, run.jobs)])
+        known = dict(zip(frames, ordered_map(fingerprint_file, paths, run.jobs), strict=True))
+        mark = _mark(recipe, plane_mark, known)
         figures = unchanged(output, products, mark)
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
@@ -139,7 +140,7 @@ def scan(
             used[before],
             used[before + 1],
         )
-    mark = recipe.fingerprint([plane_mark, *marks])
+    mark = _mark(recipe, plane_mark, dict(zip(used, marks, strict=True)))
     provenance = recipe.provenance(mark)
     with meanwhile(lambda: encode_times(output, times, footage.header, provenance)) as encoded:
         points = zero_crossings(times.time, region, numbers)
@@ -158,6 +159,15 @@ def scan(
             drawn()
     write_manifest(output, recipe, mark, figures)
     return Result("scan", output, used, 0, skipped, figures)
+
+
+def _mark(recipe: Recipe, plane: str, frames: dict[Frame, str]) -> str:
+    """What stands for the pass: its frames' content, and their numbers, which times are given in.
+
+    Args:
+        plane, frames: fingerprints of the mask and of the frames.
+    """
+    return recipe.fingerprint([plane, *(f"{frame} {own}" for frame, own in frames.items())])
 
 
 class _Reading(NamedTuple):

@@ -131,6 +131,16 @@ class _Scans:
     def names(self) -> list[str]:
         return [folder.resolve().name for folder in self.folders]
 
+    @property
+    def labels(self) -> list[str]:
+        """What tells the folders apart: their names, with those above them where they need it."""
+        paths = [folder.resolve() for folder in self.folders]
+        for depth in range(1, max(len(path.parts) for path in paths) + 1):
+            labels = ["/".join(path.parts[-depth:]) for path in paths]
+            if len(set(labels)) == len(set(paths)):
+                break
+        return labels
+
     def require_angles(self) -> None:
         """Refuse sweeps that run in nearly the same direction."""
         one, other, widest = max(pass_angles(self.passes), key=lambda row: row[2])
@@ -150,15 +160,15 @@ class _Scans:
         if known.mean() < _LEAST_KNOWN:
             raise ReshootError(
                 f"{output}: reshoot: two sweeps reached only {known.mean():.1%} of the frame"
-                f" ({', '.join(self.names)}); let every sweep cross all of it"
+                f" ({', '.join(self.labels)}); let every sweep cross all of it"
             )
         error = float(np.median(measured.error[known]))
         if error > _WORST_ERROR:
             raise ReshootError(
                 f"{output}: reshoot: the map would be off by {error:.1f} pixels"
-                f" ({', '.join(self.names)}); sweep more slowly, with a straighter edge"
+                f" ({', '.join(self.labels)}); sweep more slowly, with a straighter edge"
             )
-        figures = _figures(self.names, self.passes, measured, epipole)
+        figures = _figures(self.labels, self.passes, measured, epipole)
         self.passes.clear()
         return measured, figures
 
@@ -202,7 +212,7 @@ def _solve(
         seen = float(np.isfinite(measured.error).mean())
         if seen < _LEAST_KNOWN:
             raise ReshootError(
-                f"{output}: reshoot: the source's sweeps ({', '.join(source.names)}) show only"
+                f"{output}: reshoot: the source's sweeps ({', '.join(source.labels)}) show only"
                 f" {seen:.1%} of the ground that the target's frame needs; let them cross the same"
             )
         # Ground that the source's camera doesn't see is filled in from around it.

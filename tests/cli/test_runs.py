@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -9,10 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import av
+import click
 import cv2
 import numpy as np
 import pytest
 
+from shadowtool.cli.commands import shadowtool
 from shadowtool.cli.options import PROGRESS
 from shadowtool.io.image import write_png
 from tests.conftest import write_frames
@@ -546,6 +549,40 @@ def test_the_record_says_how_to_run_the_step_again(shot, make):
         words = [*words[: words.index("--plane")], *options] if name == "scan" else words + options
         output = make(name, str(place), words=words)
         assert said in json.loads((output / "shadowtool.json").read_text())["command"]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_recorded_command_can_be_read(shot, make, name):
+    record = json.loads((make(name, name) / "shadowtool.json").read_text())
+    program, step, *words = shlex.split(record["command"])
+    assert program == "shadowtool"
+    command = shadowtool.get_command(click.Context(shadowtool), step)
+    command.make_context(step, [*words, "-o", "again"])
+
+
+def test_sweeps_of_one_name_are_told_apart(shot, make, tmp_path):
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+    shutil.copytree(shot.scan1, tmp_path / "one" / "scan")
+    shutil.copytree(shot.scan2, tmp_path / "two" / "scan")
+    words = ["warp", tmp_path / "one" / "scan", tmp_path / "two" / "scan"]
+    figures = json.loads((make("warp", "map", words=words) / "shadowtool.json").read_text())[
+        "figures"
+    ]
+    assert list(figures["reached"]) == ["one/scan", "two/scan"]
+    assert list(figures["angles_degrees"]) == ["one/scan two/scan"]
+
+
+def test_a_renumbered_sweep_is_scanned_anew(shot, command, tmp_path):
+    shutil.copytree(shot.scan1, tmp_path / "scan")
+    (tmp_path / "sweep1").mkdir()
+    for number, file in enumerate(sorted(shot.sweep1.iterdir()), start=1):
+        shutil.copy(file, tmp_path / "sweep1" / f"sweep1.{number:04d}.exr")
+    words = replaced(shot.arguments("scan"), 1, tmp_path / "sweep1")
+    outcome = command(*words, "-o", tmp_path / "scan", "--resume", "--json")
+    assert json.loads(outcome.out)["kept"] == 0
+    lines = json.loads((tmp_path / "scan" / "lines.json").read_text())["lines"]
+    assert lines[0]["frame"] < 100
 
 
 def test_openjd_progress_of_a_movie_reaches_a_hundred_only_at_its_end(movie, command, tmp_path):

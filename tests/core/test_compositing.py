@@ -45,6 +45,14 @@ def test_the_figure_covers_by_its_alpha() -> None:
     assert over(premultiplied, alpha, background)[..., 0] == pytest.approx(expected)
 
 
+def test_what_is_unknown_behind_the_figure_does_no_harm() -> None:
+    background = np.full((1, 2, 3), np.nan, np.float32)
+    figure = np.full((1, 2, 3), 0.3, np.float32)
+    found = over(figure, np.float32([[1, 0.5]]), background)
+    assert np.array_equal(found[0, 0], figure[0, 0])
+    assert np.isnan(found[0, 1]).all()
+
+
 def test_the_ratio_multiplies_the_lit_plate_into_shadow() -> None:
     shaded = shade(SCENE.lit, SCENE.shadow, SCENE.disk(80, 45))
     ratio = shadow_ratio(shaded, SCENE.lit)

@@ -632,23 +632,35 @@ def test_a_plane_that_is_not_there_is_refused_with_the_others_named(tmp_path):
 
 
 @pytest.mark.parametrize("opaque", [False, True])
-@pytest.mark.parametrize("suffix", ["exr", "png"])
-def test_grey_in_three_channels_is_a_plane_and_colour_is_none(suffix, opaque, tmp_path):
+def test_grey_in_three_channels_is_a_plane(opaque, tmp_path):
     grey = np.repeat((random(4, 5) * 255).astype(np.uint8)[..., np.newaxis], 3, axis=-1)
-    coloured = grey.copy()
-    coloured[2, 3, 0] ^= 0x80
-    for name, values in (("grey", grey), ("coloured", coloured)):
-        if opaque:
-            values = np.dstack([values, np.full_like(values[..., 0], 255)])
-        path = tmp_path / f"{name}.{suffix}"
-        if suffix == "png":
-            write_png(path, values)
-        else:
-            write_exr(path, {"RGBA" if opaque else "RGB": (values / 255).astype(np.float32)})
-    found = read_image(tmp_path / f"grey.{suffix}").plane("A", "Y")
-    np.testing.assert_allclose(found, grey[..., 0] / 255, atol=1e-6)
-    with pytest.raises(InputError, match=rf"coloured\.{suffix}: is coloured; give one channel"):
-        read_image(tmp_path / f"coloured.{suffix}").plane("A", "Y")
+    alpha = np.full_like(grey[..., :1], 255)
+    values = np.dstack([grey, alpha]) if opaque else grey
+    write_png(tmp_path / "a.png", values)
+    write_exr(tmp_path / "a.exr", {"RGBA" if opaque else "RGB": (values / 255).astype(np.float32)})
+    for suffix in ("png", "exr"):
+        found = read_image(tmp_path / f"a.{suffix}").plane("A", "Y")
+        np.testing.assert_allclose(found, grey[..., 0] / 255, atol=1e-6)
+
+
+def test_colour_is_no_plane(png):
+    with pytest.raises(InputError, match=r"\.png: is coloured; give one channel"):
+        read_image(png).plane("A", "Y")
+
+
+@pytest.mark.parametrize("value", [0, np.nan, 1])
+def test_a_matte_stays_the_alpha_in_every_frame(value, tmp_path):
+    """Nothing to be seen yet, a bad pixel, or nothing else: colour never stands in for it."""
+    rgba = random(4, 5, 4)
+    if value == 1:
+        rgba[..., 3] = 1
+    elif value == 0:
+        rgba[..., 3] = 0
+    else:
+        rgba[1, 2, 3] = value
+    write_exr(tmp_path / "a.exr", {"RGBA": rgba})
+    found = read_image(tmp_path / "a.exr").plane("A", "Y")
+    np.testing.assert_array_equal(found, rgba[..., 3])
 
 
 def test_integer_planes_are_scaled_and_not_decoded(tmp_path):

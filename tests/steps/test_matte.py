@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shadowtool.errors import InputError
-from shadowtool.io.image import Header, read_image, write_exr, write_png
+from shadowtool.io.image import Header, decode, read_image, write_exr, write_png
 from shadowtool.steps.composite import composite
 from shadowtool.steps.matte import matte
 from shadowtool.steps.run import Run
@@ -165,6 +165,32 @@ def test_an_edge_of_a_given_alpha_is_coloured_without_the_ground(
     rim = (true.alpha > 0.3) & (true.alpha < 1)
     found = colour[rim] / true.alpha[rim][:, None]
     assert np.abs(found - true.foreground[rim]).mean() < 0.02
+
+
+def test_a_trimap_that_was_made_linear_keeps_its_edge(
+    pull: Callable[..., Path], take: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "linear").mkdir()
+    for number in (1002, 1007):
+        light = decode(drawn(number), "srgb")
+        write_exr(tmp_path / "linear" / f"trimap.{number}.exr", {"Y": light}, HEADER)
+    options = {"run": Run(frames="1002"), "only": "trimap"}
+    coded = pull("coded", trimap=take / "trimaps", **options)
+    linear = pull("linear-out", trimap=tmp_path / "linear", **options)
+    assert np.array_equal(trimap_of(linear, 1002), trimap_of(coded, 1002))
+
+
+def test_what_a_trimap_made_is_not_kept_as_what_an_alpha_makes(
+    pull: Callable[..., Path], take: Path
+) -> None:
+    run = Run(frames="1002", resume=True)
+    pull("out", trimap=take / "trimaps", only="alpha", run=run)
+    fresh = pull("fresh", alpha=take / "trimaps", only="alpha", run=run)
+    again = pull("out", alpha=take / "trimaps", only="alpha", run=run)
+    one, other = (
+        read_image(folder / "fg" / "fg.1002.exr").layers["RGBA"] for folder in (fresh, again)
+    )
+    assert np.array_equal(one, other)
 
 
 def test_an_empty_take_gives_empty_mattes(take: Path, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ Frame = int | Decimal
 
 # Frame numbers further apart than this are not one sequence.
 _WIDEST = 1_000_000
+_NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
 _TOKENS = re.compile(r"[#@]|%\d*d|\$F\d*|<UDIM>")
 
 
@@ -168,6 +169,13 @@ def parse_frames(text: str) -> list[Frame]:
 def frame_range(frames: Iterable[Frame]) -> str:
     """Frame numbers as a person writes them: ``1001-1048,1100``."""
     return str(FrameSet(sorted(frames))) or "none"
+
+
+def frame_number(text: str) -> Frame | None:
+    """The number that a frame is recorded under; None if it is none."""
+    if not _NUMBER.fullmatch(text):
+        return None
+    return Decimal(text) if "." in text else int(text)
 
 
 def frame_file(name: str, frame: Frame, suffix: str) -> str:

@@ -39,6 +39,7 @@ from shadowtool.steps.run import (
     refuse_existing,
     refuse_other_step,
     warn_of_nan,
+    with_other_chunks,
     write_manifest,
 )
 
@@ -335,6 +336,9 @@ class _Taking:
         frames = self.source.wanted
         if frames is None or manifest.get("fingerprint") != mark or not isinstance(rows, dict):
             return None
+        # What was measured of other frames says nothing of these.
+        if record.get("frames") != frame_range(frames):
+            return None
         if not isinstance(record.get("camera_motion"), dict):
             return None
         for frame in frames:
@@ -354,9 +358,9 @@ class _Taking:
         """Write the manifest, together with what other chunks of the same wrote."""
         rows: dict[str, Any] = {frame: {"fingerprint": own} for frame, own in marks.items()}
         with folder_lock(self.output):
-            before = read_record(self.output / MANIFEST)
-            if before.get("fingerprint") == mark and isinstance(before.get("frames"), dict):
-                rows = {**before["frames"], **rows}
+            rows = with_other_chunks(
+                self.output, mark, rows, lambda frame: [self.place(frame)], self.source.has
+            )
             write_manifest(self.output, self.recipe, mark, {}, rows)
 
 

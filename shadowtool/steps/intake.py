@@ -65,6 +65,7 @@ class Source:
         absent: frames that are known to be missing.
         folder: where a sequence's files are.
         marks: fingerprint of each wanted frame, where they can be told apart; else empty.
+        has: whether there is a frame of this number, wanted or not; of a movie all may be there.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Source:
     absent: list[Frame] = field(default_factory=list)
     folder: Path | None = None
     marks: dict[Frame, str] = field(default_factory=dict)
+    has: Callable[[Frame], bool] = lambda frame: True
 
 
 def open_source(
@@ -201,6 +203,7 @@ def _sequence(
         absent=[frame + offset for frame in absent],
         folder=Path(footage.sequence.pattern).parent,
         marks={frame + offset: mark for frame, mark in marks.items()},
+        has=lambda frame: frame - offset in footage.sequence.files,
     )
 
 

@@ -15,7 +15,7 @@ from shadowtool.errors import InputError, OptionError, OutputExistsError
 from shadowtool.io.files import fingerprinted, is_file, new_folders
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
-from shadowtool.io.sequence import Frame
+from shadowtool.io.sequence import Frame, frame_number, frame_range
 from shadowtool.parallel import ordered_map
 
 logger = logging.getLogger(__name__)
@@ -214,16 +214,58 @@ class FrameWork:
     ) -> Figures:
         key = self.recipe.fingerprint(self.shared)
         with folder_lock(self.output):
-            before = read_record(self.output / MANIFEST)
-            others = before.get("frames") if before.get("fingerprint") == key else None
+            merged = with_other_chunks(self.output, key, rows, self.products, self._has_sources)
             try:
-                merged = {**others, **rows} if isinstance(others, dict) else rows
                 figures = summary(list(merged.values()))
             except (AttributeError, TypeError, ValueError, OverflowError):
                 # Somebody else's hand has been in the record; what was made now is known.
                 merged, figures = rows, summary(list(rows.values()))
             write_manifest(self.output, self.recipe, key, figures, merged)
         return figures
+
+    def _has_sources(self, frame: Frame) -> bool:
+        try:
+            return all(is_file(file) for file in self.sources(frame))
+        except InputError:
+            return False
+
+
+def with_other_chunks(
+    output: Path,
+    key: str,
+    rows: dict[str, Figures],
+    products: Callable[[Frame], list[Path]],
+    has_sources: Callable[[Frame], bool] = lambda frame: True,
+) -> dict[str, Figures]:
+    """The frames of a manifest: a run's own, and what other chunks of the same have recorded.
+
+    Frames of an earlier run that belong to neither are named: who reads the folder next takes them
+    for the same take's.
+
+    Args:
+        key: the manifest's fingerprint.
+        rows: the run's own.
+        has_sources: whether what a frame is made of is still there.
+    """
+    before = read_record(output / MANIFEST)
+    recorded = before.get("frames")
+    kept, left = dict[str, Figures](), list[Frame]()
+    for name, row in recorded.items() if isinstance(recorded, dict) else ():
+        frame = frame_number(name)
+        if name in rows or frame is None:
+            continue
+        if before.get("fingerprint") == key and has_sources(frame):
+            kept[name] = row
+        elif any(map(is_file, products(frame))):
+            left.append(frame)
+    if left:
+        logger.warning(
+            "%s: frames %s are left from an earlier run, of other settings or input; remove them,"
+            " or whatever reads the folder takes them too",
+            output,
+            frame_range(left),
+        )
+    return {**kept, **rows}
 
 
 def _refuse_inputs(products: Iterable[Path], sources: Iterable[Path]) -> None:

@@ -60,12 +60,12 @@ def make(shot, command, tmp_path) -> Callable:
     return call
 
 
-def write_movie(path: Path) -> Path:
+def write_movie(path: Path, frames: int = 5) -> Path:
     rng = np.random.default_rng(3)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("ffv1", rate=25)
         stream.width, stream.height, stream.pix_fmt = 48, 32, "bgr0"
-        for _ in range(5):
+        for _ in range(frames):
             picture = rng.integers(0, 256, (32, 48, 3)).astype(np.uint8)
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="bgr0")
             container.mux(stream.encode(frame))
@@ -559,6 +559,50 @@ def test_the_recorded_command_can_be_read(shot, make, name):
     assert program == "shadowtool"
     command = shadowtool.get_command(click.Context(shadowtool), step)
     command.make_context(step, [*words, "-o", "again"])
+
+
+@pytest.mark.parametrize("name", ["capture", "matte", "apply"])
+def test_frames_left_from_a_longer_take_are_named_and_not_recorded(name, shot, command, tmp_path):
+    read, position = FRAMES_READ[name]
+    source = tmp_path / Path(read).name
+    shutil.copytree(shot.folder / read, source)
+    words = replaced(shot.arguments(name), position, source)
+    output = tmp_path / "out"
+    assert command(*words, "-o", output).code == 0
+    for number in (1005, 1006):
+        (file,) = source.glob(f"*.{number}.exr")
+        file.unlink()
+    outcome = command(*words, "-o", output, "--resume")
+    assert outcome.code == 0
+    assert "frames 1005-1006 are left from an earlier run" in outcome.err
+    record = json.loads((output / "shadowtool.json").read_text())
+    assert sorted(record["frames"]) == ["1001", "1002", "1003", "1004"]
+
+
+def test_frames_of_another_movie_are_named(movie, command, tmp_path):
+    output = tmp_path / "take"
+    assert command("capture", movie, "-o", output).code == 0
+    write_movie(movie, frames=3)
+    outcome = command("capture", movie, "-o", output, "--overwrite")
+    assert outcome.code == 0
+    assert "frames 1004-1005 are left from an earlier run" in outcome.err
+
+
+def test_chunks_of_the_same_leave_nothing(shot, command, tmp_path):
+    words = [*shot.arguments("matte"), "-o", tmp_path / "out"]
+    for frames in ("1001-1003", "1004-1006"):
+        assert "left from" not in command(*words, "--frames", frames).err
+
+
+def test_a_chunk_that_stood_still_does_not_speak_for_the_others(command, tmp_path):
+    rng = np.random.default_rng(5)
+    picture = cv2.GaussianBlur(rng.random((60, 80, 3)).astype(np.float32), (0, 0), 2)
+    moved = [np.roll(picture, 3 * (4 <= number < 7), axis=1) for number in range(10)]
+    write_frames(tmp_path / "source", moved)
+    words = ["capture", tmp_path / "source", "-o", tmp_path / "take"]
+    for frames in ("1001-1007", "1008-1010"):
+        assert command(*words, "--frames", frames).code == 0
+    assert command(*words, "--resume", "--strict").code == 1
 
 
 def test_sweeps_of_one_name_are_told_apart(shot, make, tmp_path):

@@ -15,6 +15,7 @@ from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines
 from shadowtool.core.shadow_time import ShadowTimes
 
 Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 
 # Passes less far apart than this can't fix a point.
@@ -166,11 +167,30 @@ def positions(warp: Float32) -> Float32:
     return np.clip(np.where(known, warp, np.float32(_FAR)), _FAR, -_FAR)
 
 
-def sample(image: NDArray[np.floating], places: Float32, outside: float) -> Float32:
-    """`resample` by what `positions` gave: for one map and many pictures."""
+def sample(
+    image: NDArray[np.floating], places: Float32, outside: float, unknown: Bool | None = None
+) -> Float32:
+    """`resample` by what `positions` gave: for one map and many pictures.
+
+    Args:
+        unknown: (H, W), where the image is not to be gone by. What lies half or more on such
+            pixels is NaN, the rest is made of the others; None for nowhere.
+    """
+    values = to_float(image)
+    if unknown is None:
+        return _remapped(values, places, outside)
+    hidden = unknown if image.ndim == 2 else unknown[..., np.newaxis]
+    result = _remapped(np.where(hidden, np.float32(0), values), places, outside)
+    known = _remapped((~unknown).astype(np.float32), places, 1.0)
+    weight = np.where(known > 0.5, known, np.float32(np.nan))
+    result /= weight if image.ndim == 2 else weight[..., np.newaxis]
+    return result
+
+
+def _remapped(image: Float32, places: Float32, outside: float) -> Float32:
     channels = image.shape[2] if image.ndim == 3 else 1
     result = cv2.remap(  # type: ignore[call-overload]
-        np.ascontiguousarray(to_float(image)),
+        np.ascontiguousarray(image),
         places,
         None,
         cv2.INTER_LINEAR,

@@ -14,7 +14,7 @@ from shadowtool.core.beta import inpaint
 from shadowtool.core.boxes import Box
 from shadowtool.core.compositing import over, shade, shadow_ratio
 from shadowtool.core.filling import fill_membrane
-from shadowtool.core.half_floats import to_float, to_half
+from shadowtool.core.half_floats import not_finite, to_float, to_half
 from shadowtool.core.warp_map import positions, sample
 from shadowtool.errors import InputError, OptionError
 from shadowtool.io.image import (
@@ -111,7 +111,8 @@ def composite(
         visibility, unknown = _visibility(beta_frames, frame, fill)
         figure = read_image(figure_frames.path(frame))
         if places is not None:
-            visibility = sample(visibility, places, outside=1.0)
+            holes = not_finite(visibility) if unknown else None
+            visibility = sample(visibility, places, outside=1.0, unknown=holes)
         result = np.empty(lit.shape, np.float16 if suffix == EXR else np.uint16)
         ratios = np.empty(lit.shape, np.float16) if ratio else None
         box = _figure_box(figure)

@@ -267,12 +267,14 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     def make(frame: Frame, provenance: dict[str, str]) -> Figures:
         image = read_image(sequence.path(frame))
         scaled = _scaled(places, header, image.header)
-        layers = {}
+        layers, bad = {}, np.zeros((), bool)
         for name, values in image.layers.items():
             edge = 0.0 if name == "confidence" else outside
+            unknown = not_finite(values) if values.dtype.kind == "f" else None
+            bad = bad if unknown is None else bad | unknown
             single = decode(values, "none")
-            layers[name] = _warped(single, scaled, edge, values.dtype == np.float32)
-        figures = {"not_finite": _not_finite(image)}
+            layers[name] = _warped(single, scaled, edge, unknown, values.dtype == np.float32)
+        figures = {"not_finite": int(np.count_nonzero(bad))}
         marked, quick = with_figures(provenance, figures), _has_grain(image)
         write_exr(products(frame)[0], layers, image.header, marked, quick)
         return figures
@@ -284,25 +286,24 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     return work.run(frames.present, run, frames.absent)
 
 
-def _not_finite(image: Image) -> int:
-    """In how many pixels a layer of a picture is NaN or infinite."""
-    found = [not_finite(values) for values in image.layers.values() if values.dtype.kind == "f"]
-    bad = [where for where in found if where is not None]
-    return int(np.count_nonzero(reduce(np.logical_or, bad))) if bad else 0
-
-
 def _has_grain(image: Image) -> bool:
     """Whether a picture's own file could hardly make it smaller."""
     return image.stored > _GRAIN * sum(values.nbytes for values in image.layers.values())
 
 
-def _warped(image: np.ndarray, places: np.ndarray, edge: float, single: bool) -> np.ndarray:
+def _warped(
+    image: np.ndarray,
+    places: np.ndarray,
+    edge: float,
+    unknown: np.ndarray | None,
+    single: bool,
+) -> np.ndarray:
     """The image at these places, as single or half floats."""
     shape = (*places.shape[:2], *image.shape[2:])
     result = np.empty(shape, np.float32 if single else np.float16)
     image = to_float(image)
     for rows in bands(shape):
-        values = sample(image, places[rows], edge)
+        values = sample(image, places[rows], edge, unknown)
         result[rows] = values if single else to_half(values)
     return result
 

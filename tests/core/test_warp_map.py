@@ -13,7 +13,9 @@ from shadowtool.core.warp_map import (
     identity_map,
     intersect,
     pass_angles,
+    positions,
     resample,
+    sample,
     to_st_map,
 )
 from tests.core.test_shadow_lines import SCENE, edge_times, lines_of
@@ -101,6 +103,22 @@ def test_st_maps_and_pixels_are_inverse(width: int, height: int, x: float, y: fl
     # float32 has 24 bits for a position of up to this size.
     limit = 2.0**-22 * (abs(x) + abs(y) + width + height)
     assert again == pytest.approx(warp, abs=limit)
+
+
+@pytest.mark.parametrize("shape", [(9, 13), (9, 13, 3)])
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.5, 0.8])
+def test_what_is_unknown_spreads_to_no_others(shape: tuple[int, ...], shift: float) -> None:
+    image = np.full(shape, 0.5, np.float32)
+    image[4, 6], image[2, 3] = np.nan, np.inf
+    unknown = np.zeros(shape[:2], bool)
+    unknown[4, 6] = unknown[2, 3] = True
+    warp = identity_map(9, 13)
+    warp[..., 0] += np.float32(shift)
+    found = sample(image, positions(warp), 0.5, unknown)
+    bad = ~np.isfinite(found) if found.ndim == 2 else ~np.isfinite(found).all(axis=-1)
+    # What lies midway is half of either.
+    assert bad.sum() == (4 if shift == 0.5 else 2)
+    assert found[np.isfinite(found)] == pytest.approx(0.5, abs=1e-6)
 
 
 def test_the_identity_resamples_to_the_same_picture() -> None:

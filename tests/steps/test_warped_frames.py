@@ -1,5 +1,6 @@
 """Frames seen through a map that is there."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,20 @@ def test_the_identity_leaves_all_as_it_is(
     found = read_image(tmp_path / "out" / "take" / "take.1001.exr").layers["RGB"]
     assert found.dtype == np.float16
     assert found == pytest.approx(picture, abs=1e-3)
+
+
+def test_bad_pixels_stay_where_they_are_and_are_counted(identity: Path, tmp_path: Path) -> None:
+    picture = smooth()
+    picture[10, 20, 1], picture[30, 5] = np.nan, np.inf
+    (tmp_path / "take").mkdir()
+    write_exr(tmp_path / "take" / "take.1001.exr", {"RGB": picture}, HEADER)
+    (result,) = warp([], tmp_path / "out", map_file=identity, apply_to=tmp_path / "take")
+    found = read_image(tmp_path / "out" / "take" / "take.1001.exr").layers["RGB"]
+    bad = np.argwhere(~np.isfinite(found).all(axis=-1))
+    assert bad.tolist() == [[10, 20], [30, 5]]
+    record = json.loads((tmp_path / "out" / "shadowtool.json").read_text())
+    assert record["frames"]["1001"]["not_finite"] == 2
+    assert result.frames == [1001]
 
 
 @pytest.mark.parametrize(("picture", "expected"), [(grain(), True), (smooth(), False)])

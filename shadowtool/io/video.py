@@ -129,8 +129,8 @@ class Movie:
         if trc in _UNSPECIFIED:
             transfer = "rec709"
             assumed_transfer = "the movie names no transfer function: Rec.709 is assumed"
-        self._rgb = pixel_format.is_rgb
-        self._gray = len(pixel_format.components) < 3
+        self._rgb = _of_rgb(pixel_format)
+        self._gray = not self._rgb and len(pixel_format.components) < 3
         matrix = int(context.colorspace)
         self._full = int(context.color_range) == _FULL_RANGE or pixel_format.name.startswith("yuvj")
         if not self._rgb and not self._gray:
@@ -144,7 +144,10 @@ class Movie:
                 assumed.append(f"the movie names {said}: {name} is assumed by its size")
             self._weights = _MATRICES[matrix]
         if not self._rgb and int(context.color_range) == 0 and not self._full:
-            assumed.append("the movie names no range: video range (16-235) is assumed")
+            # As FFmpeg takes it: files that hold only grey come from elsewhere than video does.
+            self._full = self._gray
+            said = "full range, as grey has," if self._gray else "video range (16-235)"
+            assumed.append(f"the movie names no range: {said} is assumed")
         bits = max(component.bits for component in pixel_format.components)
         rate = self._stream.average_rate or self._stream.guessed_rate
         return MovieInfo(
@@ -201,10 +204,10 @@ def _planes(frame: av.VideoFrame) -> tuple[list[Float32], np.float32]:
     if not _PLANAR.fullmatch(frame.format.name):
         bits = max(component.bits for component in frame.format.components)
         depth = "" if bits <= 8 else "10le" if bits <= 10 else "12le" if bits <= 12 else "16le"
-        if len(frame.format.components) < 3:
-            name = f"gray{depth}"
-        elif frame.format.is_rgb:
+        if _of_rgb(frame.format):
             name = f"gbrp{depth}"
+        elif len(frame.format.components) < 3:
+            name = f"gray{depth}"
         else:
             name = f"yuv{_subsampling(frame)}p{depth}"
         frame = frame.reformat(format=name)
@@ -218,6 +221,11 @@ def _planes(frame: av.VideoFrame) -> tuple[list[Float32], np.float32]:
         whole = rows.reshape(plane.height, plane.line_size // kind.itemsize)
         planes.append(whole[:, : plane.width].astype(np.float32))
     return planes, np.float32((1 << component.bits) - 1)
+
+
+def _of_rgb(pixel_format: av.VideoFormat) -> bool:
+    """Whether samples are red, green and blue, or numbers of such colours."""
+    return bool(pixel_format.is_rgb or pixel_format.has_palette)
 
 
 def _subsampling(frame: av.VideoFrame) -> str:

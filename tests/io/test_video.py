@@ -177,6 +177,28 @@ def test_grey_movies_are_grey(pix_fmt, bits, full, tmp_path):
     np.testing.assert_allclose(rgb, exact, atol=0.25 / (2**bits - 1))
 
 
+def test_grey_without_a_range_is_full_range_and_said_so(tmp_path):
+    movie = Movie(write_movie(tmp_path / "a.mkv", "gray", [[flat(113, HEIGHT, WIDTH, 8)]]))
+    np.testing.assert_allclose(next(movie.frames()).coded, 113 / 255, atol=1e-6)
+    assert "full range" in " ".join(movie.info.assumed)
+
+
+def test_numbered_colours_are_colours(tmp_path):
+    path = tmp_path / "a.mov"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("png", rate=25)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "pal8"
+        frame = av.VideoFrame(WIDTH, HEIGHT, "pal8")
+        colours = np.zeros((256, 4), np.uint8)
+        colours[7] = (10, 20, 230, 255)
+        frame.planes[0].update(bytes([7]) * frame.planes[0].buffer_size)
+        frame.planes[1].update(colours.tobytes())
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    # A palette's colours are stored as blue, green, red.
+    np.testing.assert_allclose(decoded(path)[0, 0], np.array([230, 20, 10]) / 255, atol=1e-6)
+
+
 def untagged(path: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
     planes = [flat(v, height // d, width // d, 8) for v, d in ((101, 1), (90, 2), (161, 2))]
     return write_movie(path, "yuv420p", [planes])

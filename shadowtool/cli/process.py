@@ -16,11 +16,13 @@ from typing import NoReturn
 import click
 
 from shadowtool.cli.commands import shadowtool
-from shadowtool.errors import ShadowtoolError
+from shadowtool.errors import RetryError, ShadowtoolError
 
 INTERRUPTED, TERMINATED = 130, 143
 # A message longer than this is one with an absurd path in it.
 _LONGEST = 1000
+# cv2.Error.StsNoMem, without the import.
+_OPENCV_NO_MEMORY = -4
 # Seconds after which a signal that was lost is acted on again.
 _AGAIN = 0.5
 # Of GNU's C library: how much of what is freed stays, from which size on pieces come from the
@@ -94,10 +96,10 @@ def run_command(arguments: Sequence[str]) -> int:
         fault = translated(error, Path(str(name)), verb)
         _say(str(fault))
         return fault.exit_code
-    except MemoryError:
-        _say("out of memory; give a smaller --jobs or run on a larger machine")
-        return 75
     except Exception as error:
+        if _is_of_memory(error):
+            _say("out of memory; give a smaller --jobs or run on a larger machine")
+            return RetryError.exit_code
         if logging.getLogger().isEnabledFor(logging.DEBUG):
             traceback.print_exc()
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -106,6 +108,14 @@ def run_command(arguments: Sequence[str]) -> int:
             f" ({os.path.basename(place.filename)}:{place.lineno}); -v shows where"  # noqa: PTH119
         )
         return 1
+
+
+def _is_of_memory(error: Exception) -> bool:
+    """Whether there was no memory: OpenCV and threads say so in ways of their own."""
+    if type(error).__module__ == "cv2":
+        return getattr(error, "code", 0) == _OPENCV_NO_MEMORY
+    no_thread = isinstance(error, RuntimeError) and "start new thread" in str(error)
+    return no_thread or isinstance(error, MemoryError)
 
 
 def _say(message: str) -> None:

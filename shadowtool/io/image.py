@@ -615,6 +615,8 @@ def _decode_png(path: Path, content: Content) -> Image:
     try:
         values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError from None
         raise DamagedFileError(f"{path}: the PNG can't be decoded: {error.err}") from None
     if values is None or not whole:
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")

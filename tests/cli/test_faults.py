@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -608,15 +609,37 @@ def test_a_full_disk_is_worth_a_retry(shot, command, tmp_path):
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_running_out_of_memory_is_worth_a_retry(shot, command, tmp_path, monkeypatch):
+def no_memory_for_opencv():
+    error = cv2.error("OpenCV: Failed to allocate 96000000 bytes")
+    error.code, error.err = cv2.Error.StsNoMem, "Failed to allocate 96000000 bytes"
+    return error
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), no_memory_for_opencv(), RuntimeError("can't start new thread")]
+)
+def test_running_out_of_memory_is_worth_a_retry(error, shot, command, tmp_path, monkeypatch):
     def starved(*args, **kwargs):
-        raise MemoryError
+        raise error
 
     monkeypatch.setattr("shadowtool.steps.plate.RobustPlates.add", starved)
     outcome = command(*shot.arguments("plate"), "--holdout", "none", "-o", tmp_path / "out")
     assert outcome.code == 75
     assert outcome.err.startswith("shadowtool: error: out of memory")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_png_that_there_is_no_memory_for_is_not_damaged(command, tmp_path, monkeypatch):
+    write_png(tmp_path / "take.1001.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+
+    def starved(*args):
+        raise no_memory_for_opencv()
+
+    monkeypatch.setattr("cv2.imdecode", starved)
+    words = ["capture", tmp_path / "take.1001.png", "-o", tmp_path / "out", "--missing", "skip"]
+    outcome = command(*words)
+    assert outcome.code == 75
+    assert "out of memory" in outcome.err
 
 
 def test_a_fault_of_our_own_is_one_line_and_a_traceback_only_on_request(

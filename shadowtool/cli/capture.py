@@ -30,7 +30,7 @@ def _crop(ctx: click.Context, parameter: click.Parameter, value: str | None) -> 
     "--start",
     type=int,
     help="Number of the first frame. Default: 1001 for a movie or camera, a sequence keeps its"
-    " own.",
+    " own. --frames goes by it in a movie, and by a sequence's own numbers.",
 )
 @click.option("--crop", callback=_crop, metavar="WxH+X+Y", help="Part of the picture to keep.")
 @click.option("--scale", type=float, default=1.0, metavar="FACTOR", help="Resize, after --crop.")

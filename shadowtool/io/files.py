@@ -174,8 +174,11 @@ def is_file(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def new_folders(paths: Iterable[Path]) -> Iterator[None]:
+def new_folders(paths: Iterable[Path], shared: bool = False) -> Iterator[None]:
     """Make output folders; if what follows fails, those that are new and still empty go again.
+
+    Args:
+        shared: others may be about to write to them, so that they stay.
 
     Raises:
         RetryError, ShadowtoolError: as `write_bytes`.
@@ -187,7 +190,7 @@ def new_folders(paths: Iterable[Path]) -> Iterator[None]:
             make_folder(path)
         yield
     except BaseException:
-        for folder in reversed(new):
+        for folder in () if shared else reversed(new):
             with contextlib.suppress(OSError):
                 folder.rmdir()
         raise

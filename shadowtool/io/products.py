@@ -6,6 +6,7 @@ Whatever is read here may have been edited by hand or by another program, so it 
 import contextlib
 import fcntl
 import json
+import logging
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
@@ -28,7 +29,18 @@ from shadowtool.core.warp_map import (
 )
 from shadowtool.errors import InputError
 from shadowtool.io.files import fingerprint, is_file, read_bytes, write_bytes
-from shadowtool.io.image import EXR, PNG, Header, Image, encode_exr, read_image, write_exr
+from shadowtool.io.image import (
+    EXR,
+    PNG,
+    Header,
+    Image,
+    encode_exr,
+    read_image,
+    resolve_transfer,
+    write_exr,
+)
+
+logger = logging.getLogger(__name__)
 
 MANIFEST = "shadowtool.json"
 LINES = "lines.json"
@@ -43,11 +55,16 @@ Provenance = Mapping[str, str]
 
 @dataclass(frozen=True)
 class StoredPlates:
-    """Plates from a folder, with what their files say of themselves."""
+    """Plates from a folder, with what their files say of themselves.
+
+    Attributes:
+        transfer: how their code values were decoded.
+    """
 
     plates: Plates
     header: Header
     fingerprint: str
+    transfer: str
 
 
 def plate_files(folder: Path) -> list[Path]:
@@ -55,8 +72,11 @@ def plate_files(folder: Path) -> list[Path]:
     return [folder / f"{name}{EXR}" for name in ("lit", "shadow", "confidence")]
 
 
-def read_plates(folder: Path) -> StoredPlates:
+def read_plates(folder: Path, transfer: str = "auto") -> StoredPlates:
     """Read ``lit`` and ``shadow`` (EXR or PNG), and ``confidence.exr`` if it is there.
+
+    Args:
+        transfer: of plates in PNG; those in EXR are taken as they are.
 
     Raises:
         InputError: a plate is missing, or their sizes differ.
@@ -78,9 +98,11 @@ def read_plates(folder: Path) -> StoredPlates:
             shadow_frames = _counts(image.channel("shadow_frames"))
         if image.header.size != lit.header.size:
             raise InputError(f"{confidence}: is not of the plates' size")
-    light, shade = (image.rgb().astype(np.float32, copy=False) for image in (lit, shadow))
+    coded = transfer if PNG in {image.path.suffix.lower() for image in (lit, shadow)} else "auto"
+    light, shade = (to_float(image.rgb(coded)) for image in (lit, shadow))
     plates = Plates(light, shade, frames, shadow_frames)
-    return StoredPlates(plates, lit.header, " ".join(i.fingerprint for i in images))
+    mark = " ".join(image.fingerprint for image in images)
+    return StoredPlates(plates, lit.header, mark, resolve_transfer(coded, lit.path))
 
 
 def _counts(values: NDArray[np.float32]) -> NDArray[np.uint32]:
@@ -265,6 +287,12 @@ def _require_st_map(image: Image, st_map: NDArray[np.float32]) -> None:
         raise InputError(f"{image.path}: was made by `shadowtool {''.join(step)}`, is no ST map")
     if image.header.bits == 8:
         raise InputError(f"{image.path}: 8 bits can't tell pixels apart; give an ST map in EXR")
+    if any(values.dtype == np.float16 for values in image.layers.values()):
+        logger.warning(
+            "%s: half floats are too coarse for an ST map, by up to half a pixel at 2K; write it as"
+            " 32 bit float",
+            image.path,
+        )
     known = st_map[np.isfinite(st_map).all(axis=-1)]
     # A map in pixels, or of displacements, has most of its values elsewhere.
     if not known.size or np.median(np.abs(known - 0.5)) > _FAR_OUTSIDE:

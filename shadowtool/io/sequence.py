@@ -107,7 +107,12 @@ class Sequence:
             wanted = parse_frames(frames)
         present = [frame for frame in wanted if frame in self.files]
         absent = [frame for frame in wanted if frame not in self.files]
-        if absent and (missing == "error" or not present):
+        if absent and not present:
+            raise InputError(
+                f"{self.pattern}: missing frames {frame_range(absent)};"
+                f" it has only {frame_range(self.files)}"
+            )
+        if absent and missing == "error":
             raise InputError(
                 f"{self.pattern}: missing frames {frame_range(absent)};"
                 " restore them, or give --missing skip"
@@ -248,7 +253,7 @@ def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
 
 def _single(path: Path) -> Sequence:
     if path.suffix.lower() not in (EXR, PNG):
-        raise InputError(f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on it first")
+        raise _unreadable(path)
     number = re.fullmatch(r"(.*)[._](-?\d+)", path.stem) or re.fullmatch(r"(.*?)-?(\d+)", path.stem)
     if number is None:
         return Sequence(path.stem, os.fspath(path), {1: path})
@@ -259,7 +264,7 @@ def _single(path: Path) -> Sequence:
 def _of_pattern(path: Path, role: str) -> Sequence:
     suffix = path.suffix
     if suffix.lower() not in (EXR, PNG):
-        raise InputError(f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on it first")
+        raise _unreadable(path)
     try:
         # One digit for each #, as we write patterns ourselves.
         wanted = FileSequence(path.name, pad_style=PAD_STYLE_HASH1)
@@ -294,6 +299,13 @@ def _of_pattern(path: Path, role: str) -> Sequence:
 def _frames(frame_set: Iterable[int | float | Decimal]) -> list[Frame]:
     """Frame numbers as fileseq gives them, which is never a float for numbers read from text."""
     return [f if isinstance(f, int) else Decimal(str(f)) for f in frame_set]
+
+
+def _unreadable(path: Path) -> InputError:
+    return InputError(
+        f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on a movie, and convert other"
+        " pictures first"
+    )
 
 
 def _short(text: str) -> str:

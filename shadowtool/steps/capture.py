@@ -36,6 +36,7 @@ from shadowtool.steps.run import (
     Result,
     Run,
     current,
+    name_of_frames,
     refuse_existing,
     refuse_other_step,
     warn_of_nan,
@@ -123,10 +124,7 @@ def capture(
         {"input": opened.name},
     )
     suffix = EXR if file_format == "exr" else PNG
-    # Frames whose names begin with a dot would be hidden.
-    name = output.resolve().name.lstrip(".")
-    if not name.isprintable() or not name:
-        raise OptionError(f"-o {str(output)!r}: frames are named after it; give a plain name")
+    name = name_of_frames(output)
     taking = _Taking(opened, recipe, output, name, suffix, transfer, crop, size, run)
     mark = recipe.fingerprint([opened.fingerprint])
     refuse_other_step("capture", output, run)
@@ -144,7 +142,7 @@ def capture(
         refuse_existing(map(taking.place, opened.wanted), run)
     else:
         refuse_existing((file for file in there if file.suffix == suffix), run)
-    with new_folders([output]):
+    with new_folders([output], shared=run.frames is not None):
         frames, skipped, report = taking.take()
         if not frames:
             raise InputError(f"{opened.name}: no frame of the wanted range is in it")

@@ -29,9 +29,17 @@ from shadowtool.io.image import (
 )
 from shadowtool.io.products import WARP, read_plates, read_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
-from shadowtool.steps.footage import require_frames, require_size
+from shadowtool.steps.footage import require_frames, require_size, say_plates_assumed
 from shadowtool.steps.matte import BETA_FOLDER, FIGURE_FOLDER
-from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
+from shadowtool.steps.run import (
+    Figures,
+    FrameWork,
+    Recipe,
+    Result,
+    Run,
+    name_of_frames,
+    with_figures,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -71,6 +79,7 @@ def composite(
     beta_frames = open_sequence(beta or _part(mattes, BETA_FOLDER), "β")
     frames, absent = beta_frames.select(run.frames, run.missing)
     stored = read_plates(plates)
+    say_plates_assumed(plates, stored)
     lit, shadow, repaired = _complete(stored.plates.lit, stored.plates.shadow)
     header = stored.header
     for sequence in (figure_frames, beta_frames):
@@ -82,7 +91,7 @@ def composite(
         places, mark = _places(warp, header, f"the plates in {plates}")
         shared.append(mark)
     suffix = EXR if file_format == "exr" else PNG
-    name = output.resolve().name
+    name = name_of_frames(output)
     recipe = Recipe(
         "composite",
         {"fill": fill, "format": file_format, "ratio": ratio},
@@ -169,7 +178,7 @@ def _places(warp: Path, header: Header, of: str) -> tuple[Float32, str]:
 def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:
     """β of a frame, (H, W) or (H, W, 3), and how many of its pixels are unknown."""
     image = read_image(sequence.path(frame))
-    coloured = "RGB" in image.layers
+    coloured = not image.layers.keys().isdisjoint({"RGB", "RGBA"})
     values = to_float(image.rgb("none")) if coloured else image.plane("Y")
     holes = ~np.isfinite(values)
     if holes.any():

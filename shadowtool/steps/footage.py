@@ -18,6 +18,7 @@ from shadowtool.core.noise import (
 )
 from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
+from shadowtool.io.products import StoredPlates
 from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
 
@@ -108,6 +109,16 @@ def say_assumed(footage: Footage, transfer: str) -> None:
             "%s: PNG is taken as %s; give --transfer if it is not",
             footage.sequence.pattern,
             footage.transfer,
+        )
+
+
+def say_plates_assumed(folder: Path, stored: StoredPlates, transfer: str = "auto") -> None:
+    """The same of plates."""
+    if transfer == "auto" and stored.transfer != "linear":
+        logger.warning(
+            "%s: PNG is taken as %s; write the plates as EXR if they are not",
+            folder,
+            stored.transfer,
         )
 
 

@@ -38,6 +38,7 @@ from shadowtool.steps.footage import (
     require_frames,
     require_size,
     say_assumed,
+    say_plates_assumed,
 )
 from shadowtool.steps.keyframes import Keyframes
 from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
@@ -100,7 +101,8 @@ def matte(
     footage = open_footage(source, "frames", transfer, run.missing)
     say_assumed(footage, transfer)
     frames, absent = footage.sequence.select(run.frames, run.missing)
-    stored = read_plates(plates)
+    stored = read_plates(plates, transfer)
+    say_plates_assumed(plates, stored, transfer)
     require_size(plates, stored.header, footage.header, footage.sequence.pattern)
     if alpha is not None and (trimap is not None or only == "trimap"):
         raise OptionError("--alpha needs no trimaps; give it without --trimap and --only trimap")

@@ -139,6 +139,19 @@ def refuse_other_step(step: str, output: Path, run: Run) -> None:
         )
 
 
+def name_of_frames(output: Path) -> str:
+    """What frames that are written right into a folder are called: as it is.
+
+    Raises:
+        OptionError: it has no name that a file could have.
+    """
+    # Frames whose names begin with a dot would be hidden.
+    name = output.resolve().name.lstrip(".")
+    if not name.isprintable() or not name:
+        raise OptionError(f"-o {str(output)!r}: frames are named after it; give a plain name")
+    return name
+
+
 @dataclass(frozen=True)
 class FrameWork:
     """One step's work on single frames.
@@ -177,7 +190,7 @@ class FrameWork:
         folders = {file.parent for frame in frames for file in self.products(frame)}
         rows: dict[str, Figures] = {}
         skipped, kept = list(absent), 0
-        with new_folders([self.output, *sorted(folders)]):
+        with new_folders([self.output, *sorted(folders)], shared=run.frames is not None):
             run.progress(0, len(frames))
             results = ordered_map(lambda frame: self._frame(frame, run), frames, run.jobs)
             for number, (frame, outcome) in enumerate(zip(frames, results, strict=True), start=1):

@@ -1,5 +1,6 @@
 """The displacement map from scans, and frames seen through it."""
 
+import logging
 import math
 from dataclasses import dataclass
 from functools import reduce
@@ -25,6 +26,7 @@ from shadowtool.errors import OptionError, ReshootError
 from shadowtool.io.files import is_file, make_folder
 from shadowtool.io.image import (
     EXR,
+    PNG,
     Header,
     Image,
     decode,
@@ -49,6 +51,8 @@ from shadowtool.steps.run import (
     write_manifest,
 )
 from shadowtool.steps.solve import solve
+
+logger = logging.getLogger(__name__)
 
 PICTURE = "warp.png"
 
@@ -245,6 +249,11 @@ def _open_frames(source: str | Path, output: Path, run: Run) -> _Frames:
     if run.missing == "error":
         for frame in present:
             read_header(sequence.path(frame))
+    if any(sequence.path(frame).suffix.lower() == PNG for frame in present):
+        logger.warning(
+            "%s: PNG's code values are written to EXR as they are; run capture on pictures first",
+            sequence.pattern,
+        )
     frames = _Frames(sequence, present, absent, output / sequence.name)
     refuse_existing(map(frames.place, present), run)
     return frames

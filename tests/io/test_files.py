@@ -20,6 +20,7 @@ from shadowtool.io.files import (
     fingerprint_file,
     fingerprinted,
     make_folder,
+    new_folders,
     read_bytes,
     read_content,
     unchanging,
@@ -238,6 +239,13 @@ def test_nothing_else_is_swept(tmp_path):
         (tmp_path / name).write_bytes(b"")
     make_folder(tmp_path)
     assert names(tmp_path) == sorted(kept)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_new_folders_go_again_unless_others_may_write_there(shared, tmp_path):
+    with pytest.raises(ValueError, match="x"), new_folders([tmp_path / "a/b"], shared):
+        raise ValueError("x")
+    assert (tmp_path / "a/b").exists() == shared
 
 
 @pytest.mark.parametrize("place", ["file", "file/below", "n" * 10_000])

@@ -124,12 +124,35 @@ def test_plates_from_a_paint_program_need_no_confidence(tmp_path):
     np.testing.assert_allclose(plates.shadow, 0.21586, atol=1e-5)
 
 
+@pytest.mark.parametrize(("transfer", "value"), [("auto", 0.21586), ("none", 128 / 255)])
+def test_plates_in_png_are_decoded_as_the_footage_is(transfer, value, tmp_path):
+    for name in ("lit", "shadow"):
+        write_png(tmp_path / f"{name}.png", np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+    stored = read_plates(tmp_path, transfer)
+    np.testing.assert_allclose(stored.plates.lit, value, atol=1e-5)
+    assert stored.transfer == ("srgb" if transfer == "auto" else transfer)
+
+
+def test_plates_in_exr_are_what_they_are(tmp_path):
+    write_plates(tmp_path, example_plates(), random(HEIGHT, WIDTH), HEADER, MADE)
+    stored = read_plates(tmp_path, "srgb")
+    np.testing.assert_array_equal(stored.plates.lit, example_plates().lit)
+    assert stored.transfer == "linear"
+
+
 @pytest.mark.parametrize("missing", ["lit", "shadow"])
 def test_a_missing_plate_is_named(missing, tmp_path):
     write_plates(tmp_path, example_plates(), random(HEIGHT, WIDTH), HEADER, MADE)
     (tmp_path / f"{missing}.exr").unlink()
     with pytest.raises(InputError, match=rf"has no {missing}\.exr; make the plates with"):
         read_plates(tmp_path)
+
+
+def test_a_coarse_map_is_told_of(tmp_path, caplog):
+    st_map = np.full((HEIGHT, WIDTH, 4), 0.5, np.float16)
+    write_exr(tmp_path / WARP, {"RGBA": st_map}, HEADER)
+    read_warp(tmp_path / WARP)
+    assert "half floats are too coarse for an ST map" in caplog.text
 
 
 @pytest.mark.parametrize("folder", ["nowhere", "n" * 10_000])

@@ -69,3 +69,28 @@ def test_a_figure_of_code_values_is_found_too(tmp_path: Path) -> None:
     white = empty()
     white[30:40, 70:75] = 1
     assert put(tmp_path, codes, ".png") == pytest.approx(expected(white), abs=1e-3)
+
+
+def test_beta_may_come_with_an_alpha(tmp_path: Path) -> None:
+    plain = put(tmp_path / "plain", spots())
+    folder = tmp_path / "nuke"
+    folder.mkdir()
+    rgba = np.repeat(BETA[..., np.newaxis], 4, axis=-1)
+    rgba[..., 3] = 1
+    write_exr(folder / "beta.1001.exr", {"RGBA": rgba}, HEADER)
+    mattes, plates = tmp_path / "plain" / "matte", tmp_path / "plain" / "plates"
+    composite(mattes, tmp_path / ".out", plates=plates, beta=folder)
+    # A name that begins with a dot would hide the frames.
+    assert np.array_equal(read_image(tmp_path / ".out" / "out.1001.exr").layers["RGB"], plain)
+
+
+def test_what_plates_in_png_are_taken_for_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    put(tmp_path, spots())
+    (tmp_path / "coded").mkdir()
+    for name in ("lit", "shadow"):
+        codes = np.full((SCENE.height, SCENE.width, 3), 128, np.uint8)
+        write_png(tmp_path / "coded" / f"{name}.png", codes)
+    composite(tmp_path / "matte", tmp_path / "again", plates=tmp_path / "coded")
+    assert "coded: PNG is taken as srgb" in caplog.text

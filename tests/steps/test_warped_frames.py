@@ -30,13 +30,16 @@ def smooth() -> np.ndarray:
     return np.full((HEIGHT, WIDTH, 3), 0.5, np.float16)
 
 
-def test_a_pictures_alpha_is_warped_with_it(identity: Path, tmp_path: Path) -> None:
+def test_a_pictures_alpha_is_warped_with_it(
+    identity: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     picture = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 4)).astype(np.uint8)
     (tmp_path / "take").mkdir()
     write_png(tmp_path / "take" / "take.1001.png", picture)
     warp([], tmp_path / "out", map_file=identity, apply_to=tmp_path / "take")
     found = read_image(tmp_path / "out" / "take" / "take.1001.exr").layers["RGBA"]
     assert np.abs(found - picture / 255).max() < 1e-3
+    assert "code values are written to EXR as they are" in caplog.text
 
 
 @pytest.mark.parametrize("picture", [grain(), smooth()])

@@ -150,8 +150,8 @@ def test_a_missing_plate_is_named(missing, tmp_path):
 
 def test_a_coarse_map_is_told_of(tmp_path, caplog):
     st_map = np.full((HEIGHT, WIDTH, 4), 0.5, np.float16)
-    write_exr(tmp_path / WARP, {"RGBA": st_map}, HEADER)
-    read_warp(tmp_path / WARP)
+    write_exr(tmp_path / "warp.exr", {"RGBA": st_map}, HEADER)
+    read_warp(tmp_path / "warp.exr")
     assert "half floats are too coarse for an ST map" in caplog.text
 
 

@@ -70,8 +70,7 @@ def run_command(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code; messages go to stderr."""
     logging.basicConfig(format="shadowtool: %(message)s", stream=sys.stderr, force=True)
     try:
-        code = shadowtool.main(list(arguments), "shadowtool", standalone_mode=False)
-        return code if isinstance(code, int) else 0
+        return _code_of(arguments)
     except click.ClickException as error:
         error.show()
         return error.exit_code
@@ -110,6 +109,17 @@ def run_command(arguments: Sequence[str]) -> int:
         return 1
 
 
+def _code_of(arguments: Sequence[str]) -> int:
+    try:
+        code = shadowtool.main(list(arguments), "shadowtool", standalone_mode=False)
+    except Exception as error:
+        # A library whose import a signal stops says that its import failed.
+        if (signalled := _signalled(error)) is not None:
+            raise signalled from None
+        raise
+    return code if isinstance(code, int) else 0
+
+
 def _is_of_memory(error: Exception) -> bool:
     """Whether there was no memory: OpenCV and threads say so in ways of their own."""
     if type(error).__module__ == "cv2":
@@ -146,13 +156,16 @@ def _stop(kind: type[BaseException]) -> NoReturn:
 
 
 def _stop_if_dropped(kind: type[BaseException]) -> None:
-    error = sys.exc_info()[1]
-    while error is not None:
-        if isinstance(error, kind):
-            # It is on its way, and threads are being waited for.
-            return
+    # Else it is on its way, and threads are being waited for.
+    if not isinstance(_signalled(sys.exc_info()[1]), kind):
+        raise kind
+
+
+def _signalled(error: BaseException | None) -> BaseException | None:
+    """What a signal raised, if an exception came of it."""
+    while error is not None and not isinstance(error, (_Terminated, _Interrupted)):
         error = error.__context__
-    raise kind
+    return error
 
 
 def _arrived() -> None:

@@ -63,6 +63,21 @@ def test_what_is_tidied_up_meanwhile_is_not_disturbed(number, kind):
     assert tidied
 
 
+@pytest.mark.parametrize(
+    ("code", "kind"), [(143, process._Terminated), (130, process._Interrupted)]
+)
+def test_a_signal_that_stops_an_import_is_no_fault(code, kind, monkeypatch, capsys):
+    def importing(*args, **kwargs):
+        try:
+            raise kind
+        except BaseException as error:
+            raise ImportError("initialization failed") from error
+
+    monkeypatch.setattr(process.shadowtool, "main", importing)
+    assert process.run_command(["plate"]) == code
+    assert "a fault of shadowtool's own" not in capsys.readouterr().err
+
+
 def test_other_things_that_cannot_be_raised_are_still_shown(capsys):
     thing = Something()
     reference = weakref.ref(thing, lambda _: 1 // 0)

@@ -179,9 +179,13 @@ def capture(
 
 
 class _Measured(NamedTuple):
-    """What is kept of a frame once it is written."""
+    """What is kept of a frame once it is written.
+
+    ``mark`` is the fingerprint in its file.
+    """
 
     arriving: Arriving
+    mark: str
     linear: Float32
     shift: float | None
     clipped: float
@@ -255,9 +259,6 @@ class _Taking:
     def place(self, frame: Frame) -> Path:
         return self.output / frame_file(self.name, frame, self.suffix)
 
-    def mark(self, arriving: Arriving) -> str:
-        return self.recipe.fingerprint([arriving.fingerprint])
-
     def take(self) -> tuple[list[Frame], list[Frame], _Report]:
         """Write all frames; those written, those skipped, and what was measured."""
         report, frames, skipped = _Report(), list[Frame](), list[Frame]()
@@ -281,7 +282,7 @@ class _Taking:
             if isinstance(done, _Measured):
                 frames.append(done.arriving.frame)
                 report.add(done)
-                report.marks[str(done.arriving.frame)] = self.mark(done.arriving)
+                report.marks[str(done.arriving.frame)] = done.mark
             else:
                 skipped.append(done)
             self.run.progress(number, max(total, number) if total else 0)
@@ -292,7 +293,7 @@ class _Taking:
     def _write(self, arriving: Arriving, reference: Float32 | None) -> _Measured:
         loaded = arriving.load()
         linear = self._linear(loaded.values)
-        path, mark = self.place(arriving.frame), self.mark(arriving)
+        path, mark = self.place(arriving.frame), self.recipe.fingerprint([loaded.fingerprint])
         kept = self.run.resume and current([path], mark) is not None
         if not kept:
             provenance = self.recipe.provenance(mark)
@@ -309,7 +310,7 @@ class _Taking:
         clipped = float((loaded.values >= top).any(axis=-1).mean())
         bad = not_finite(linear)
         count = 0 if bad is None else int(np.count_nonzero(bad))
-        return _Measured(arriving, linear, shift, clipped, count, kept)
+        return _Measured(arriving, mark, linear, shift, clipped, count, kept)
 
     @staticmethod
     def _prepared(linear: Float32) -> Float32:
@@ -339,11 +340,12 @@ class _Taking:
             return None
         if not isinstance(record.get("camera_motion"), dict):
             return None
+        marks = self.source.marks(self.run.jobs)
         for frame in frames:
             row = rows.get(str(frame))
             mark = str(row.get("fingerprint")) if isinstance(row, dict) else ""
-            if self.source.marks:
-                mark = self.recipe.fingerprint([self.source.marks[frame]])
+            if marks:
+                mark = self.recipe.fingerprint([marks[frame]])
             if current([self.place(frame)], mark) is None:
                 return None
         # Written anew, so that make sees that the step has been looked after.

@@ -17,6 +17,7 @@ from shadowtool.io.files import fingerprint_file, fingerprint_movie
 from shadowtool.io.image import EXR, PNG, Header
 from shadowtool.io.sequence import Frame, parse_frames
 from shadowtool.io.video import Movie, MovieFrame, camera_frames
+from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import open_footage
 
 FIRST_FRAME = 1001
@@ -24,10 +25,17 @@ FIRST_FRAME = 1001
 
 @dataclass(frozen=True)
 class Loaded:
-    """A frame's code values (H, W, 3), and its header."""
+    """A frame.
+
+    Attributes:
+        values: (H, W, 3) code values.
+        header: the file's, or what stands for it.
+        fingerprint: of what it is made of.
+    """
 
     values: NDArray[np.floating]
     header: Header
+    fingerprint: str
 
 
 @dataclass(frozen=True)
@@ -37,13 +45,11 @@ class Arriving:
     Attributes:
         frame: the number that it gets.
         seconds: when it was taken, None if unknown.
-        fingerprint: of what it is made of.
         load: reads it; raises DamagedFileError.
     """
 
     frame: Frame
     seconds: float | None
-    fingerprint: str
     load: Callable[[], Loaded]
 
 
@@ -64,7 +70,8 @@ class Source:
         earliest: reads the first frame of all that can be read, wanted or not; None for none.
         absent: frames that are known to be missing.
         folder: where a sequence's files are.
-        marks: fingerprint of each wanted frame, where they can be told apart; else empty.
+        marks: reads the fingerprint of each wanted frame, on so many threads, where a frame is a
+            file of its own; else empty.
         has: whether there is a frame of this number, wanted or not; of a movie all may be there.
     """
 
@@ -80,7 +87,7 @@ class Source:
     earliest: Callable[[], Loaded | None]
     absent: list[Frame] = field(default_factory=list)
     folder: Path | None = None
-    marks: dict[Frame, str] = field(default_factory=dict)
+    marks: Callable[[int | None], dict[Frame, str]] = lambda jobs: {}
     has: Callable[[Frame], bool] = lambda frame: True
 
 
@@ -135,13 +142,13 @@ def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
                 f"{path}: its frame at position {item.position} is damaged; copy the movie again,"
                 " or go on without it by --missing skip"
             )
-        return Loaded(item.coded, header)
+        return Loaded(item.coded, header, f"{mark} {item.position}")
 
     def arriving() -> Iterator[Arriving]:
         for item in movie.frames():
             frame = start + item.position
             if chosen is None or frame in chosen:
-                yield Arriving(frame, item.seconds, f"{mark} {item.position}", partial(load, item))
+                yield Arriving(frame, item.seconds, partial(load, item))
             if chosen is not None and frame >= max(chosen):
                 return
 
@@ -173,15 +180,19 @@ def _sequence(
     first = footage.sequence.frames[0]
     offset = 0 if start is None else start - first
     png = footage.sequence.path(present[0]).suffix.lower() == PNG
-    marks = {frame: fingerprint_file(footage.sequence.path(frame)) for frame in present}
+
+    def marks(jobs: int | None) -> dict[Frame, str]:
+        files = [footage.sequence.path(frame) for frame in present]
+        found = ordered_map(fingerprint_file, files, jobs)
+        return {frame + offset: mark for frame, mark in zip(present, found, strict=True)}
 
     def load(frame: Frame) -> Loaded:
         image = footage.image(frame)
-        return Loaded(image.rgb("none"), image.header)
+        return Loaded(image.rgb("none"), image.header, image.fingerprint)
 
     def arriving() -> Iterator[Arriving]:
         for frame in present:
-            yield Arriving(frame + offset, None, marks[frame], partial(load, frame))
+            yield Arriving(frame + offset, None, partial(load, frame))
 
     def earliest() -> Loaded | None:
         for frame in footage.sequence.frames:
@@ -202,7 +213,7 @@ def _sequence(
         earliest=earliest,
         absent=[frame + offset for frame in absent],
         folder=Path(footage.sequence.pattern).parent,
-        marks={frame + offset: mark for frame, mark in marks.items()},
+        marks=marks,
         has=lambda frame: frame - offset in footage.sequence.files,
     )
 
@@ -215,11 +226,11 @@ def _camera(device: int, seconds: float, transfer: str, start: int) -> Source:
     mark = uuid.uuid4().hex
 
     def load(item: MovieFrame) -> Loaded:
-        return Loaded(item.coded, header)
+        return Loaded(item.coded, header, mark)
 
     def arriving() -> Iterator[Arriving]:
         for item in chain([first], frames):
-            yield Arriving(start + item.position, item.seconds, mark, partial(load, item))
+            yield Arriving(start + item.position, item.seconds, partial(load, item))
 
     return Source(
         name=f"camera {device}",

@@ -22,8 +22,8 @@ Bool = NDArray[np.bool_]
 Powers = Sequence[tuple[int, int]]
 
 # Half the windows' widths, pixels, for edges that move up to so many pixels a frame; and the
-# largest for any.
-RADII, _STEP, _WIDEST = (1, 2, 4, 7), 12.0, 40
+# largest for any. Where a step is longer than usual, the largest must still reach over it.
+RADII, _STEP, _WIDEST = (1, 2, 4, 7), 8.0, 40
 # Mean squared deviation from its plane, in squared errors, above which a window holds more than
 # one surface.
 _MISFIT = 1.5
@@ -68,11 +68,11 @@ class Windows:
     def for_step(cls, step: float, radii: tuple[int, ...] = RADII) -> "Windows":
         """For edges that move ``step`` pixels a frame.
 
-        What happens between two frames is told by windows about as wide as the step. In smaller
-        ones all pixels say the same, and no more than a few of them.
+        What happens between two frames is told by windows wider than the step. In smaller ones
+        all pixels say the same, and no more than a few of them.
 
         Args:
-            radii: for steps of up to 12 pixels.
+            radii: for steps of up to 8 pixels.
         """
         factor = max(step / _STEP, 1.0)
         return cls(tuple(min(round(radius * factor), _WIDEST) for radius in radii), factor)

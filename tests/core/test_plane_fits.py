@@ -180,8 +180,10 @@ def test_rows_alone_are_those_of_the_whole() -> None:
 
 
 def test_windows_grow_with_the_step() -> None:
-    assert Windows.for_step(10) == Windows()
-    assert Windows.for_step(36) == Windows(tuple(3 * radius for radius in RADII), 3.0)
+    assert Windows.for_step(8) == Windows()
+    assert Windows.for_step(24) == Windows(tuple(3 * radius for radius in RADII), 3.0)
+    for step in (5, 8, 12, 20):
+        assert 2 * max(Windows.for_step(step).radii) + 1 > 1.5 * step
     assert Windows.for_step(1e6).reach < 200
 
 

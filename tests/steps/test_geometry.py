@@ -24,12 +24,15 @@ SWEEPS = {
 }
 
 
-def shoot(folder: Path, sweep: Sweep, swing: float = 0.0) -> Path:
-    """The noisy frames of a sweep, under light that swings by a part of itself."""
+def shoot(folder: Path, sweep: Sweep, swing: float = 0.0, uneven: float = 0.0) -> Path:
+    """The noisy frames of a sweep, under light that swings by a part of itself, by a hand whose
+    pace does."""
     header = Header(SCENE.width, SCENE.height)
     folder.mkdir(parents=True)
-    for frame in range(SCENE.frames_of(sweep)):
-        image = SCENE.noisy(SCENE.image(SCENE.sweep_beta(sweep, frame)), frame)
+    count = SCENE.frames_of(sweep)
+    pace = 1 + uneven * np.sin(np.arange(count) / 2.5)
+    for frame, moment in enumerate(np.cumsum(pace) - pace[0]):
+        image = SCENE.noisy(SCENE.image(SCENE.sweep_beta(sweep, moment)), frame)
         image *= np.float32(1 + swing * np.sin(frame / 3))
         write_exr(folder / f"take.{1001 + frame}.exr", {"RGB": to_half(image)}, header)
     return folder
@@ -77,6 +80,21 @@ def test_w_is_found_to_a_fraction_of_a_pixel(scans: list[Path], tmp_path: Path, 
     assert (error[sure] < 1).mean() > 0.9
     # The block's displacement is the same everywhere: its light is infinitely far away.
     assert np.abs(result.figures["light"]["at"]).max() > 1000
+
+
+def test_a_hand_may_be_now_fast_and_now_slow(tmp_path: Path, mask: str) -> None:
+    folders = [
+        scan(shoot(tmp_path / "frames" / name, sweep, uneven=0.75), tmp_path / name, plane=mask)
+        for name, sweep in SWEEPS.items()
+    ]
+    warp([result.output for result in folders], tmp_path / "map")
+    found, _, _ = read_warp(tmp_path / "map" / WARP)
+    known = np.isfinite(found.error)
+    error = np.linalg.norm(found.warp - SCENE.warp, axis=-1)
+    assert np.median(error[known & SCENE.plane]) < 0.3
+    assert np.percentile(error[known & SCENE.plane], 90) < 0.8
+    sure = known & (found.error < 1)
+    assert (error[sure] < 1).mean() > 0.9
 
 
 def test_light_that_changes_moves_no_time(scans: list[Path], tmp_path: Path, mask: str) -> None:

@@ -74,7 +74,8 @@ def intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
         speeds: for each pass the speed of each of its lines, pixels a frame (`line_speed`).
 
     Returns:
-        W; unknown where fewer than two passes that differ by `LEAST_ANGLE` reached the pixel.
+        W; unknown where fewer than two passes that differ by `LEAST_ANGLE` reached the pixel. Where
+        the lines of three or more don't meet, its error is larger by as much as they miss it.
     """
     shape = passes[0].times.time.shape
     found = WarpMap(np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
@@ -91,7 +92,7 @@ def _intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
     weighted = np.zeros((5, *shape))
     information = np.zeros((3, *shape))
     least_cosine = np.full(shape, np.inf)
-    normals = []
+    normals, through = [], []
     best = min(float(scan.lines.residual.min()) for scan in passes)
     for scan, speed in zip(passes, speeds, strict=True):
         known = np.isfinite(scan.times.time)
@@ -113,6 +114,7 @@ def _intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
         normal = np.full((*shape, 2), np.nan)
         normal[known] = np.stack([nx, ny], axis=-1)
         normals.append(normal)
+        through.append((known, nx, ny, d, precision))
     # |n·m| of the best separated pair of passes: the cosine of their angle.
     for i, one in enumerate(normals):
         for other in normals[i + 1 :]:
@@ -129,8 +131,27 @@ def _intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
         warp[..., 1] = np.where(known, (b * e - a * f) / determinant, np.nan)
         ia, ib, ic = information
         variance = (ia + ic) / (ia * ic - ib * ib)
+        variance *= np.maximum(_scatter(warp, through), 1)
         error[known] = np.sqrt(variance[known])
     return WarpMap(warp, error)
+
+
+def _scatter(
+    warp: Float32, through: list[tuple[Bool, Float64, Float64, Float64, Float64]]
+) -> Float64:
+    """By how much lines of three passes or more miss the point that is found for them, (H, W): the
+    mean square in units of their variances; 0 of two, which always meet.
+
+    Args:
+        through: of each pass the pixels that it reached, and their lines' nx, ny, d and 1/σ².
+    """
+    count = np.zeros(warp.shape[:2], np.int8)
+    square = np.zeros(warp.shape[:2])
+    for known, nx, ny, d, precision in through:
+        x, y = warp[known].T
+        count[known] += 1
+        square[known] += precision * (nx * x + ny * y + d) ** 2
+    return np.asarray(square * (count > 2) / np.maximum(count - 2, 1), np.float64)
 
 
 def pass_angles(passes: list[Pass]) -> list[tuple[int, int, float]]:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -73,6 +75,18 @@ def test_a_pass_of_low_contrast_counts_less() -> None:
     solved = intersected([one, two, late])
     known = np.isfinite(solved.error)
     assert np.percentile(np.linalg.norm(solved.warp - SCENE.warp, axis=-1)[known], 95) < 0.1
+
+
+def test_lines_of_three_passes_that_do_not_meet_are_known_to_be_off() -> None:
+    one, two, three = passes()
+    late = replace(three.times, time=three.times.time + 3)
+    solved = intersected([one, two, Pass(late, three.lines)])
+    known = np.isfinite(solved.error)
+    error = np.linalg.norm(solved.warp - SCENE.warp, axis=-1)
+    assert np.median(error[known]) > 2
+    assert (error[known] < 3 * solved.error[known]).mean() > 0.95
+    # Those of two always meet.
+    assert np.nanmedian(intersected([two, Pass(late, three.lines)]).error[known]) < 2
 
 
 def test_angles_and_speed_are_those_of_the_sweeps() -> None:

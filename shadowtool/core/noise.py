@@ -26,6 +26,9 @@ _ONE_CODE = 0.7
 # Each quantile of |x| that rare noise is judged by, for a standard normal x; in how many tiles
 # along each side; and how much too large it has to be.
 _RARE, _TILES, _HEAVY = (0.9, 1.6448536), 8, 1.2
+# Ground is lit that is brighter than the first part of what it was at most, and something dark has
+# passed it if it was darker than the second; in so many tiles at least.
+_LIGHT, _SHADE, _LEAST_TILES = 0.8, 0.6, 4
 _LEVELS = 12
 _GRID = 10_000
 _SAMPLES = 8
@@ -127,7 +130,9 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
 
     From neighbouring frames. A codec may repeat a pixel's noise until it sends the pixel anew;
     then frames far apart are compared. And what a codec leaves of noise is often next to nothing
-    and sometimes far off: then σ is that of normal noise that is as often as far off.
+    and sometimes far off: then σ is that of normal noise that is as often as far off. Or it sends
+    a pixel anew only when something else is to be seen there, and each time comes out elsewhere:
+    then σ is that of what was seen before and after.
 
     Args:
         samples: thinned frames (h, w, 3) under the running numbers of `sample_positions`; any may
@@ -166,8 +171,16 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
         for channel in range(3)
         for level in range(_LEVELS)
     ]
-    times = _heaviness(compared, share, noise_model(levels))
-    return [replace(level, sigma=level.sigma * float(times[level.channel])) for level in levels]
+    model = noise_model(levels)
+    times = _heaviness(compared, share, model)
+    times = np.maximum(times, _renewal([samples[a] for a in firsts], model))
+    # By the model's noise, of which there is some even where a codec leaves none.
+    return [
+        replace(level, sigma=factor * float(model.sigma(np.full(3, level.value))[level.channel]))
+        if (factor := float(times[level.channel])) > 1
+        else level
+        for level in levels
+    ]
 
 
 def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
@@ -245,20 +258,55 @@ def _heaviness(pairs: list[tuple[Float32, Float32]], share: float, noise: NoiseM
         with np.errstate(invalid="ignore", over="ignore"):
             sigma = noise.sigma((first + second) / 2) * np.float32(np.sqrt(2))
             off = np.abs(first - second) / sigma
-        rare = _quantile_in_tiles(off, _RARE[0])
+        rare = _in_tiles(off, _RARE[0]).reshape(-1, 3)
+        rare = rare[np.isfinite(rare).all(axis=-1)]
         if rare.size:
             found.append(np.median(rare, axis=0) / _RARE[1])
     times = np.quantile(found, share, axis=0) if found else np.ones(3)
     return np.where(times < _HEAVY, 1.0, times)
 
 
-def _quantile_in_tiles(off: Float32, part: float) -> Float64:
-    """A quantile of each channel of a picture (h, w, 3) in each tile, (T, 3). Pixels that are not
-    finite are left out, and tiles of few others."""
-    height, width = off.shape[:2]
+def _renewal(frames: list[Float32], noise: NoiseModel) -> Float64:
+    """How many times as far as by this model's noise ground is off what it was, (3,), after
+    something dark has passed it; 1 where that is next to nothing, or nothing did.
+
+    Args:
+        frames: thinned, spread over the take in its order.
+    """
+    if len(frames) < 3:
+        return np.ones(3)
+    stack = np.stack(frames)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        gray = stack.sum(axis=-1)
+        brightest = gray.max(axis=0)
+        lit, dark = gray > _LIGHT * brightest, gray < _SHADE * brightest
+        first, last = lit.argmax(axis=0), len(stack) - 1 - lit[::-1].argmax(axis=0)
+        number = np.arange(len(stack))[:, np.newaxis, np.newaxis]
+        passed = (dark & (number > first) & (number < last)).any(axis=0)
+        before, after = (
+            np.take_along_axis(stack, which[np.newaxis, ..., np.newaxis], axis=0)[0]
+            for which in (first, last)
+        )
+        before, after = (np.where(passed[..., np.newaxis], v, np.nan) for v in (before, after))
+        # What a tile has in common is light that changed.
+        common = _in_tiles((after / before).astype(np.float32), 0.5)
+        off = np.abs(after - before * _of_tiles(common, passed.shape))
+        off /= noise.sigma((before + after) / 2) * np.float32(np.sqrt(2))
+        rare = _in_tiles(off, _RARE[0]).reshape(-1, 3)
+    known = np.isfinite(rare).all(axis=-1)
+    if known.sum() < _LEAST_TILES:
+        return np.ones(3)
+    times = np.median(rare[known], axis=0) / _RARE[1]
+    return np.where(times < _HEAVY, 1.0, times)
+
+
+def _in_tiles(picture: Float32, part: float) -> Float64:
+    """A quantile of each channel of a picture (h, w, 3) in each tile, (T, T, 3). Pixels that are
+    not finite are left out; NaN for tiles of few others."""
+    height, width = picture.shape[:2]
     rows, columns = (-(-size // _TILES) for size in (height, width))
     whole = np.full((3, _TILES * rows, _TILES * columns), np.nan, np.float32)
-    whole[:, :height, :width] = np.moveaxis(off, -1, 0)
+    whole[:, :height, :width] = np.moveaxis(picture, -1, 0)
     whole[:, ~np.isfinite(whole).all(axis=0)] = np.nan
     tiles = whole.reshape(3, _TILES, rows, _TILES, columns).swapaxes(2, 3)
     # NaN comes last.
@@ -268,7 +316,15 @@ def _quantile_in_tiles(off: Float32, part: float) -> Float64:
     place = part * (count[enough] - 1)
     before = place.astype(int)
     low, high = ordered[:, enough, before], ordered[:, enough, before + 1]
-    return np.asarray((low + (high - low) * (place - before)).T, np.float64)
+    found = np.full((_TILES**2, 3), np.nan)
+    found[enough] = (low + (high - low) * (place - before)).T
+    return found.reshape(_TILES, _TILES, 3)
+
+
+def _of_tiles(values: Float64, shape: tuple[int, ...]) -> Float64:
+    """Each pixel's own of values of tiles (T, T, 3): (h, w, 3)."""
+    rows, columns = (np.arange(size) // -(-size // _TILES) for size in shape)
+    return np.asarray(values[rows[:, np.newaxis], columns], np.float64)
 
 
 def _code_steps(values: Float32) -> Float32:

@@ -99,6 +99,36 @@ def test_noise_that_a_codec_makes_rare_and_large_is_as_large_as_it_is_far_off() 
     assert (off > 3).mean() < 1 / 100
 
 
+def passed_by(frames: int, error: float, noise: float, light: float) -> list[np.ndarray]:
+    """Ground past a quarter of which a shadow moves, sent anew with another error whenever it
+    changes; meanwhile the light grows by a part of itself."""
+    rng = np.random.default_rng(5)
+    clean = rng.uniform(0.2, 0.5, (240, 320, 3))
+    sent, before, shots = clean.copy(), np.full((240, 320), -1), []
+    for number in range(frames):
+        shaded = np.zeros((240, 320), int)
+        shaded[:60, 9 * number : 9 * number + 40] = 1
+        anew = (shaded != before)[..., np.newaxis]
+        image = clean * np.where(shaded, 0.25, 1)[..., np.newaxis]
+        sent = np.where(anew, image + error * rng.normal(size=image.shape), sent)
+        before = shaded
+        grown = 1 + light * number / frames
+        shots.append(sent * grown + noise * rng.normal(size=image.shape))
+    return shots
+
+
+def test_what_a_codec_sends_anew_only_where_something_passed_is_off_by_as_much() -> None:
+    model = model_of(passed_by(40, error=0.01, noise=0.0, light=0.0))
+    for value in (0.08, 0.3):
+        assert model.sigma(np.full(3, value)) == pytest.approx([0.01] * 3, rel=0.25)
+
+
+@pytest.mark.parametrize("light", [0.0, 0.15])
+def test_what_passes_makes_no_noise(light: float) -> None:
+    model = model_of(passed_by(40, error=0.0, noise=0.005, light=light))
+    assert model.sigma(np.full(3, 0.3)) == pytest.approx([0.005] * 3, rel=0.25)
+
+
 @pytest.mark.parametrize("moving", [False, True])
 def test_normal_noise_is_not_taken_for_rare_and_large(moving: bool) -> None:
     shots = take(24, moving=moving)

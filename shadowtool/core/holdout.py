@@ -160,7 +160,9 @@ def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float3
     if alike.sum() < 20:
         return np.full(3, 0.25, np.float32)
     time, pixel = np.nonzero(alike)
-    ratios = stack[time, :, pixel] / bright[:, pixel].T
+    # A channel may be black where the colour is not.
+    light = bright[:, pixel].T
+    ratios = stack[time, :, pixel] / np.where(light > 0, light, 1)
     return np.asarray(np.clip(np.median(ratios, axis=0), 0, 0.9), np.float32)
 
 

@@ -7,6 +7,7 @@ interpolated; the paper's x = m·y + b fails for lines near horizontal.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -29,9 +30,13 @@ _LEAST_SPREAD = 4.0
 _HYPOTHESES, _JUDGES, _NEAR = 200, 500, 2.0
 # A line is poor if its residual is this many times the pass's median, and larger than the floor.
 _POOR_RATIO, _POOR_FLOOR = 2.5, 0.5
+# So many poor lines in a row are replaced.
+_LONGEST_RUN = 4
 # A direction jumps if it is this many times the pass's median deviation off its neighbours'
 # course, and by more than the floor, radians.
 _JUMP_RATIO, _JUMP_FLOOR = 5.0, np.radians(0.75)
+# About so many pixels tell how far they are off their lines.
+_SOME_PLACES = 50_000
 # Bends are looked for in about so many lines, and told from so many.
 _BENT_LINES, _LEAST_BENT = 24, 5
 
@@ -90,7 +95,7 @@ def fit_shadow_lines(groups: dict[int, Float64], frames: Float64) -> ShadowLines
     poor = _poor(fits)
     fits, refitted = _refit(fits, poor, groups)
     fits = _aligned(fits)
-    dropped = _poor(fits) | _jumping(fits, frames)
+    dropped = _replaceable(_poor(fits), fits) | _jumping(fits, frames)
     kept = {i: line for i, line in fits.items() if i not in dropped}
     if len(kept) < 2:
         raise NoLinesError("no two lines on the plane agree with each other")
@@ -154,6 +159,26 @@ def line_speed(lines: ShadowLines, shape: tuple[int, ...]) -> Float64:
     speed[0], speed[-1] = step[0], step[-1]
     speed[1:-1] = (step[:-1] + step[1:]) / 2
     return speed
+
+
+def off_lines(time: Float32, plane: NDArray[np.bool_], lines: ShadowLines) -> Float32:
+    """How far pixels on the reference plane lie off the line of their own time, where each should
+    lie on it.
+
+    Args:
+        time: (H, W), frame numbers; NaN unknown.
+        plane: (H, W), the reference plane region.
+
+    Returns:
+        (N,) float32 ≥ 0, pixels, of some of those whose time the lines span; empty if there is
+        none.
+    """
+    places = np.flatnonzero(plane & np.isfinite(time))
+    places = places[:: max(1, places.size // _SOME_PLACES)]
+    y, x = np.divmod(places, time.shape[1])
+    own = interpolate_lines(lines, time[y, x].astype(np.float64))
+    distance = np.abs(own.normal[:, 0] * x + own.normal[:, 1] * y + own.offset)
+    return distance[np.isfinite(distance)].astype(np.float32)
 
 
 class Bend(NamedTuple):
@@ -349,6 +374,17 @@ def _poor(fits: dict[int, _Line]) -> set[int]:
     residuals = np.asarray([line.residual for line in fits.values()])
     limit = max(_POOR_RATIO * float(np.median(residuals)), _POOR_FLOOR)
     return {i for i, line in fits.items() if line.residual > limit}
+
+
+def _replaceable(poor: set[int], fits: dict[int, _Line]) -> set[int]:
+    """Poor lines but for those of many frames in a row with others before and after: between lines
+    so far apart nothing tells where the edge was, which these do."""
+    good = sorted(set(fits) - poor)
+    kept = set(poor)
+    for before, after in pairwise(good):
+        if after - before - 1 > _LONGEST_RUN:
+            kept -= set(range(before + 1, after))
+    return kept
 
 
 def _refit(

@@ -65,6 +65,9 @@ logger = logging.getLogger(__name__)
 Bool = NDArray[np.bool_]
 
 HOLDOUT_FOLDER = "holdout"
+UNDER_A_CARD = "a scene under a card"
+# Of a scene under a card less than this part in its shadow is worth a word.
+_WELL_SHADED = 0.9
 # Sampled frames are kept for the second reading up to so many bytes, as far as these with what the
 # estimate takes for each pixel stay below a gigabyte.
 _KEPT, _WITH_ESTIMATE, _PER_PIXEL = 500 << 20, 1000 << 20, 100
@@ -199,6 +202,13 @@ def plate(
         pass
     if figures.get("shaded") == 0:
         logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
+    elif figures.get("read_as") == UNDER_A_CARD and figures["shaded"] < _WELL_SHADED:
+        logger.warning(
+            "%s: %.0f%% of the picture never got darker; it is in shade already, or the card's full"
+            " shadow was never there",
+            footage.sequence.pattern,
+            100 * (1 - figures["shaded"]),
+        )
     write_manifest(output, recipe, mark, figures)
     return Result("plate", output, take.used, 0, [*absent, *take.skipped], figures)
 
@@ -489,7 +499,7 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         plates = Plates(lit, shadow, found.lit_frames, found.shadow_frames)
         seen = found.lit_frames > 0
         shaded = found.shadow_frames > 0
-        reading = "a plane that a shadow crossed" if completed.partial else "a scene under a card"
+        reading = "a plane that a shadow crossed" if completed.partial else UNDER_A_CARD
         figures: Figures = {
             "gains": take.gains,
             "shaded": round(float(shaded.mean()), 4),

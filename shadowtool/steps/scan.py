@@ -22,6 +22,7 @@ from shadowtool.core.shadow_lines import (
     fit_shadow_lines,
     line_bend,
     line_speed,
+    off_lines,
     zero_crossings,
 )
 from shadowtool.core.shadow_time import (
@@ -72,6 +73,9 @@ _LITTLE, _FAST = 0.5, 20.0
 # Times differ by so many times what noise explains only if something is wrong; and by so many,
 # with less than this part of the edges on lines, only if what moved is no straight shadow.
 _TREMBLING, _NO_SWEEP, _ON_LINES = 2.0, 4.0, 0.5
+# Pixels of the plane are off the lines of their times by more than this, pixels; and so many are
+# only if something is wrong.
+_OFF, _MANY_OFF = 2.0, 0.06
 # Between frames so many times further apart than usual the shadow passes more than can be told.
 _HOLE = 3.0
 # If more of the frame than this can't be told from one reading, the frames are read again.
@@ -153,7 +157,11 @@ def scan(
         make_folder(output)
         with meanwhile(lambda: write_png(output / PICTURE, draw(), provenance)) as drawn:
             bend = line_bend(points, numbers, lines, footage.header.size)
-            figures = _figures(times, lines, gains, bend) | {"errors_raised": round(raised, 2)}
+            off = off_lines(times.time, region, lines) > _OFF
+            figures = _figures(times, lines, gains, bend) | {
+                "errors_raised": round(raised, 2),
+                "off_lines": round(float(off.mean()), 4) if off.size else 0.0,
+            }
             _advise(figures, footage.sequence.pattern)
             write_scan(output, Pass(times, lines), footage.header, provenance, encoded())
             drawn()
@@ -366,6 +374,13 @@ def _advise(figures: Figures, take: str) -> None:
             " trembles or a codec does that, fix it or stabilize the take",
             take,
             figures["errors_raised"],
+        )
+    if figures["off_lines"] > _MANY_OFF:
+        logger.warning(
+            "%s: %.0f%% of the plane lies off the edge's lines; a board that is bent, a stick that"
+            " is too narrow, or something else that crosses does that",
+            take,
+            100 * figures["off_lines"],
         )
     if figures["pixels_per_frame"] > _FAST:
         logger.warning(

@@ -59,6 +59,8 @@ PICTURE = "warp.png"
 # Maps of which less of the frame is measured, or of which half is predicted to be off by more
 # pixels, are of no use.
 _LEAST_KNOWN, _WORST_ERROR = 0.05, 8.0
+# Displacements of more pixels than this have a direction that can be told.
+_DISPLACED = 8.0
 # A file that takes up more than this part of its pixels' room holds grain.
 _GRAIN = 0.5
 
@@ -222,6 +224,13 @@ def _solve(
         # Ground that the source's camera doesn't see is filled in from around it.
         result = diffuse(measured, 0)
         figures["source"]["seen"] = round(seen, 4)
+    if figures["light"] is None and figures["displacement"]["p99"] > _DISPLACED:
+        logger.warning(
+            "%s: the shadow is displaced by up to %.0f pixels, but not towards one place, as by one"
+            " light; objects are less well known",
+            output,
+            figures["displacement"]["p99"],
+        )
     provenance = recipe.provenance(mark)
     make_folder(output)
     write_warp(output / WARP, result, target.header, provenance)

@@ -8,6 +8,7 @@ from shadowtool.core.shadow_lines import (
     fit_shadow_lines,
     interpolate_lines,
     line_bend,
+    off_lines,
     zero_crossings,
 )
 from shadowtool.core.warp_map import identity_map
@@ -138,6 +139,34 @@ def test_a_line_whose_direction_jumps_is_replaced_by_its_neighbours() -> None:
     at = int(np.nonzero(lines.frame == frame)[0][0])
     assert lines.origin[at] == "interpolated"
     assert errors(lines, sweep)[at] < 0.3
+
+
+@pytest.mark.parametrize(("frames", "replaced"), [(3, True), (15, False)])
+def test_poor_lines_are_replaced_unless_they_are_all_that_there_is(
+    frames: int, replaced: bool
+) -> None:
+    sweep = Sweep(0.0)
+    time = edge_times(sweep)
+    rows = np.arange(SCENE.height)[:, None] / SCENE.height - 0.5
+    bent = (time > 20 - 0.5) & (time < 20 + frames - 0.5)
+    sagging = time + np.where(bent, 3 * (rows**2 - 1 / 12), 0).astype(np.float32)
+    lines = fitted(sweep, sagging)
+    middle = int(np.nonzero(lines.frame == 20 + frames // 2)[0][0])
+    assert (lines.origin[middle] == "interpolated") == replaced
+    assert errors(lines, sweep)[middle] < 1
+
+
+def test_what_passes_the_plane_off_its_lines_is_counted() -> None:
+    sweep = Sweep(0.3)
+    time = edge_times(sweep)
+    lines = fitted(sweep, time)
+    assert np.percentile(off_lines(time, SCENE.plane, lines), 99) < 0.2
+    late = time.copy()
+    late[:9] += 2
+    off = off_lines(late, SCENE.plane, lines)
+    rows = (np.nonzero(SCENE.plane)[0] < 9).mean()
+    assert (off > 5).mean() == pytest.approx(rows, abs=0.02)
+    assert off_lines(np.full_like(time, np.nan), SCENE.plane, lines).size == 0
 
 
 def test_interpolated_lines_lie_between_and_keep_their_length() -> None:

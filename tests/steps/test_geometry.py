@@ -247,6 +247,22 @@ def test_a_lens_that_bows_the_lines_is_reported(
     assert "as a lens bends them" in caplog.text
 
 
+def test_an_edge_that_is_not_straight_is_told_of(
+    tmp_path: Path, mask: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = shoot(tmp_path / "frames", SWEEPS["first"])
+    straight = scan(frames, tmp_path / "straight", plane=mask)
+    assert "off the edge's lines" not in caplog.text
+    for frame, path in enumerate(sorted(frames.iterdir())):
+        image = SCENE.image(SCENE.sweep_beta(SWEEPS["first"], frame))
+        # As if the board stood out at one end.
+        image[:14] = SCENE.image(SCENE.sweep_beta(SWEEPS["first"], frame + 1.5))[:14]
+        write_exr(path, {"RGB": to_half(SCENE.noisy(image, frame))}, Header(160, 90))
+    bent = scan(frames, tmp_path / "bent", plane=mask)
+    assert "off the edge's lines" in caplog.text
+    assert straight.figures["off_lines"] < 0.02 < 0.1 < bent.figures["off_lines"]
+
+
 def test_a_camera_that_trembles_is_told_by_times_that_differ_by_more_than_noise(
     tmp_path: Path, mask: str
 ) -> None:

@@ -487,3 +487,21 @@ def test_a_holdout_that_someone_corrected_is_not_replaced_unasked(
     assert corrected.read_bytes() == before
     plate(takes / "walk", tmp_path / "again", holdout=tmp_path / "roto")
     assert plates_of(tmp_path / "again").frames.max() <= FRAMES - 1
+
+
+def test_a_card_that_stops_half_way_is_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(2)
+    lit = rng.uniform(0.2, 0.8, (80, 120, 3))
+    for name, last in (("whole", 220), ("half", 100)):
+        frames = []
+        for right in np.linspace(0, last, 40):
+            x = np.arange(120)
+            beta = 1 - ((x < right) & (x >= right - 90))[np.newaxis, :, np.newaxis]
+            image = lit * (0.25 + 0.75 * beta) + 0.003 * rng.normal(size=lit.shape)
+            frames.append(image.astype(np.float32))
+        write_frames(tmp_path / name, frames)
+        result = plate(tmp_path / name, tmp_path / f"plates-{name}")
+        assert result.figures["read_as"] == "a scene under a card"
+        assert ("never got darker" in caplog.text) == (name == "half")

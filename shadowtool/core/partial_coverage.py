@@ -32,7 +32,7 @@ _COMMON = 0.45
 # The slope of log(S/L), per pixel, at which a partial shadow is as likely as a surface.
 _SLOPE = 0.05
 # A shadow that reached more than this part of a picture was cast to reach all of it.
-_MOST = 0.6
+_MOST, _NEARLY_ALL = 0.6, 0.85
 # Within this many times the materials' spread a measured ratio is the plane's.
 _ALIKE = 2.5
 # So many pixels at a time stay in the processor's cache.
@@ -125,8 +125,10 @@ def complete_shadow(
     """
     seen, dark = np.isfinite(channel_sum(lit)), np.isfinite(channel_sum(shadow))
     if plane is None:
-        firm = (frames >= _FIRM) & seen
-        partial = bool(firm.sum() < _MOST * max(int(seen.sum()), 1))
+        pixels = max(int(seen.sum()), 1)
+        firm, some = (((frames >= least) & seen).sum() / pixels for least in (_FIRM, 1))
+        # A card that goes by quickly shades no pixel often, but all.
+        partial = bool(firm < _MOST and some < _NEARLY_ALL)
         region = np.full(dark.shape, partial)
     else:
         partial, region = True, plane

@@ -136,6 +136,15 @@ def test_under_a_card_the_shadow_is_left_as_measured() -> None:
     assert found.shadow[shaded] == pytest.approx(take.measured[shaded], rel=1e-6)
 
 
+def test_a_card_that_went_by_quickly_is_one_too() -> None:
+    # Most pixels were in full shadow for a frame or two.
+    take = crossed(surfaces(), np.zeros((HEIGHT, WIDTH)), frames=1)
+    take = take._replace(frames=np.where(COLUMNS < 60, 4, 1).astype(np.uint32))
+    found = take.completed()
+    assert not found.partial
+    assert np.percentile(take.error(found.shadow), 90) < 0.05
+
+
 def test_under_a_card_what_was_never_darkened_stays_lit() -> None:
     take = carded()
     never = take.frames == 0

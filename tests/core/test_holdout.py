@@ -203,6 +203,19 @@ def test_what_a_few_pixels_lose_makes_no_common_ratio(places: int) -> None:
     assert ((ratio > 0.2) & (ratio < 0.8)).all()
 
 
+def test_a_channel_may_be_black() -> None:
+    lit = np.random.default_rng(3).uniform(0.3, 0.7, (60, 80, 3)).astype(np.float32)
+    lit[::2, :, 2] = 0
+    frames = []
+    for number in range(12):
+        frame = lit.copy()
+        frame[20:40, 5 * number : 5 * number + 20] *= 0.25
+        frames.append(frame)
+    background = find_background(frames, NOISE)
+    assert np.isfinite(background.lit).all()
+    assert np.isfinite(background.shadow).all()
+
+
 def test_a_take_without_a_figure_holds_nothing_out() -> None:
     assert not any(mask.any() for mask in shoot("empty").masks)
 

@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.plates
 
-On the rendered scenes of `footage`, with camera-like noise, as clean frames, as 10-bit H.264, and as
-a consumer's 8-bit H.264.
+On the rendered scenes of `footage`, with camera-like noise, as clean frames, as 10-bit H.264, and
+as a consumer's 8-bit H.264.
 PSNR in dB of sRGB-encoded values; β as mean absolute error where the figure does not hide it.
 """
 

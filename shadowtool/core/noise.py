@@ -93,7 +93,8 @@ def sample_positions(frames: int) -> dict[int, int]:
 
 
 def thin(image: NDArray[np.floating]) -> Float32:
-    """The fixed grid of about 10,000 pixels, (h, w, 3), of a frame (H, W, 3) that is looked at."""
+    """The fixed grid of about 10,000 pixels that is looked at of a frame, (H, W, 3) to (h, w, 3),
+    or of one of its channels."""
     step = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / _GRID)))
     return image[::step, ::step].astype(np.float32)
 

@@ -216,10 +216,13 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
             if run.missing == "skip":
                 return None
             raise
-        transfer = footage.transfer
-        sample = thin(image.rgb(transfer)) if position in samples.values() else None
-        picture = display(image.rgb(transfer)) if position == 0 else None
-        gray = luminance_halfs(*image.colours(transfer))
+        colours = image.colours(footage.transfer)
+        sample = picture = None
+        if position in samples.values():
+            sample = np.stack([thin(plane) for plane in colours], axis=-1)
+        if position == 0:
+            picture = np.stack([display(plane) for plane in colours], axis=-1)
+        gray = luminance_halfs(*colours)
         return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
 
     finder, exposure = CrossingFinder(), RunningGain()

@@ -82,6 +82,20 @@ def test_w_is_found_to_a_fraction_of_a_pixel(scans: list[Path], tmp_path: Path, 
     assert np.abs(result.figures["light"]["at"]).max() > 1000
 
 
+def test_displacements_towards_no_one_place_are_told_of(
+    scans: list[Path],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    warp(scans, tmp_path / "one")
+    assert "not towards one place" not in caplog.text
+    monkeypatch.setattr("shadowtool.steps.solve.find_epipole", lambda *args: None)
+    (result,) = warp(scans, tmp_path / "none")
+    assert "not towards one place" in caplog.text
+    assert result.figures["light"] is None
+
+
 def test_a_hand_may_be_now_fast_and_now_slow(tmp_path: Path, mask: str) -> None:
     folders = [
         scan(shoot(tmp_path / "frames" / name, sweep, uneven=0.75), tmp_path / name, plane=mask)

@@ -173,8 +173,10 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
         for level in range(_LEVELS)
     ]
     model = noise_model(levels)
-    times = _heaviness(compared, share, model)
-    times = np.maximum(times, _renewal([samples[a] for a in firsts], model))
+    times = np.maximum(
+        _heaviness(compared, share, model), _renewal([samples[a] for a in firsts], model)
+    )
+    times = np.where(times < _HEAVY, 1.0, times)
     # By the model's noise, of which there is some even where a codec leaves none.
     return [
         replace(level, sigma=factor * float(model.sigma(np.full(3, level.value))[level.channel]))
@@ -251,25 +253,22 @@ def _ascending(values: Float32) -> NDArray[np.int64]:
 
 def _heaviness(pairs: list[tuple[Float32, Float32]], share: float, noise: NoiseModel) -> Float64:
     """How many times as far off as normal noise of this model rare noise is in most of the picture,
-    (3,): what moved is in some places, and noise in all. 1 where that is next to nothing. Of the
-    pairs this share is no better."""
+    (3,): what moved is in some places, and noise in all. 1 where nothing tells. Of the pairs this
+    share is no better."""
     found = []
     for first, second in pairs:
         # What is not finite is left out below.
         with np.errstate(invalid="ignore", over="ignore"):
             sigma = noise.sigma((first + second) / 2) * np.float32(np.sqrt(2))
             off = np.abs(first - second) / sigma
-        rare = _in_tiles(off, _RARE[0]).reshape(-1, 3)
-        rare = rare[np.isfinite(rare).all(axis=-1)]
-        if rare.size:
-            found.append(np.median(rare, axis=0) / _RARE[1])
-    times = np.quantile(found, share, axis=0) if found else np.ones(3)
-    return np.where(times < _HEAVY, 1.0, times)
+        if (rare := _rare(off)).size:
+            found.append(np.median(rare, axis=0))
+    return np.quantile(found, share, axis=0) if found else np.ones(3)
 
 
 def _renewal(frames: list[Float32], noise: NoiseModel) -> Float64:
     """How many times as far as by this model's noise ground is off what it was, (3,), after
-    something dark has passed it; 1 where that is next to nothing, or nothing did.
+    something dark has passed it; 1 where nothing did.
 
     Args:
         frames: thinned, spread over the take in its order.
@@ -293,12 +292,19 @@ def _renewal(frames: list[Float32], noise: NoiseModel) -> Float64:
         common = _in_tiles((after / before).astype(np.float32), 0.5)
         off = np.abs(after - before * _of_tiles(common, passed.shape))
         off /= noise.sigma((before + after) / 2) * np.float32(np.sqrt(2))
-        rare = _in_tiles(off, _RARE[0]).reshape(-1, 3)
-    known = np.isfinite(rare).all(axis=-1)
-    if known.sum() < _LEAST_TILES:
-        return np.ones(3)
-    times = np.median(rare[known], axis=0) / _RARE[1]
-    return np.where(times < _HEAVY, 1.0, times)
+    rare = _rare(off)
+    return np.median(rare, axis=0) if len(rare) >= _LEAST_TILES else np.ones(3)
+
+
+def _rare(off: Float32) -> Float64:
+    """How far off rare pixels are in each tile that tells, as parts of how far off those of normal
+    noise would be: (T, 3).
+
+    Args:
+        off: (h, w, 3), standard deviations; pixels that are not finite are left out.
+    """
+    rare = _in_tiles(off, _RARE[0]).reshape(-1, 3) / _RARE[1]
+    return rare[np.isfinite(rare).all(axis=-1)]
 
 
 def _in_tiles(picture: Float32, part: float) -> Float64:

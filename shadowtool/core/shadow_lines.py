@@ -162,8 +162,8 @@ def line_speed(lines: ShadowLines, shape: tuple[int, ...]) -> Float64:
 
 
 def off_lines(time: Float32, plane: NDArray[np.bool_], lines: ShadowLines) -> Float32:
-    """How far pixels on the reference plane lie off the line of their own time, where each should
-    lie on it.
+    """How far pixels on the reference plane lie off the line of their own time, |n·p + d|, where
+    each should lie on it.
 
     Args:
         time: (H, W), frame numbers; NaN unknown.

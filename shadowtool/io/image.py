@@ -165,16 +165,13 @@ class Image:
         only = list(self.layers.values())
         if len(only) == 1 and only[0].ndim == 2:
             return _unit(only[0])
-        coloured = False
-        for layer in ("RGB", "RGBA"):
-            if layer in self.layers:
-                grey = _grey(self.layers[layer])
-                if grey is not None:
-                    return grey
-                coloured = True
+        colour = self.layers.get("RGB", self.layers.get("RGBA"))
+        grey = None if colour is None else _grey(colour)
+        if grey is not None:
+            return grey
         if opaque is not None:
             return opaque
-        if coloured:
+        if colour is not None:
             raise InputError(
                 f"{self.path}: is coloured; give one channel, an alpha, or a grey picture"
             )

@@ -58,7 +58,7 @@ class StoredPlates:
     """Plates from a folder, with what their files say of themselves.
 
     Attributes:
-        transfer: how their code values were decoded.
+        transfer: how their code values were decoded, "linear" if they are light already.
     """
 
     plates: Plates
@@ -98,11 +98,16 @@ def read_plates(folder: Path, transfer: str = "auto") -> StoredPlates:
             shadow_frames = _counts(image.channel("shadow_frames"))
         if image.header.size != lit.header.size:
             raise InputError(f"{confidence}: is not of the plates' size")
-    coded = transfer if PNG in {image.path.suffix.lower() for image in (lit, shadow)} else "auto"
-    light, shade = (to_float(image.rgb(coded)) for image in (lit, shadow))
+    coded = [
+        resolve_transfer(transfer, image.path) if image.path.suffix.lower() == PNG else "linear"
+        for image in (lit, shadow)
+    ]
+    light, shade = (to_float(i.rgb(own)) for i, own in zip((lit, shadow), coded, strict=True))
     plates = Plates(light, shade, frames, shadow_frames)
     mark = " ".join(image.fingerprint for image in images)
-    return StoredPlates(plates, lit.header, mark, resolve_transfer(coded, lit.path))
+    # One in EXR may stand beside one in PNG, of which there is more to say.
+    said = next((own for own in coded if own != "linear"), "linear")
+    return StoredPlates(plates, lit.header, mark, said)
 
 
 def _counts(values: NDArray[np.float32]) -> NDArray[np.uint32]:

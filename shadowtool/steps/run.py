@@ -248,7 +248,7 @@ def with_other_chunks(
     key: str,
     rows: dict[str, Figures],
     products: Callable[[Frame], list[Path]],
-    has_sources: Callable[[Frame], bool] = lambda frame: True,
+    has_sources: Callable[[Frame], bool],
 ) -> dict[str, Figures]:
     """The frames of a manifest: a run's own, and what other chunks of the same have recorded.
 

@@ -133,6 +133,16 @@ def test_plates_in_png_are_decoded_as_the_footage_is(transfer, value, tmp_path):
     assert stored.transfer == ("srgb" if transfer == "auto" else transfer)
 
 
+def test_a_plate_in_exr_beside_one_in_png_is_what_it_is(tmp_path):
+    light = random(HEIGHT, WIDTH, 3)
+    write_exr(tmp_path / "lit.exr", {"RGB": light}, HEADER)
+    write_png(tmp_path / "shadow.png", np.full((HEIGHT, WIDTH, 3), 128, np.uint8))
+    stored = read_plates(tmp_path, "rec709")
+    np.testing.assert_array_equal(stored.plates.lit, light)
+    np.testing.assert_allclose(stored.plates.shadow, 0.2616, atol=2e-4)
+    assert stored.transfer == "rec709"
+
+
 def test_plates_in_exr_are_what_they_are(tmp_path):
     write_plates(tmp_path, example_plates(), random(HEIGHT, WIDTH), HEADER, MADE)
     stored = read_plates(tmp_path, "srgb")

@@ -8,7 +8,7 @@ plane is known best, among those that the measurements agree with.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ from shadowtool.core.bands import bands
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Floats = NDArray[np.floating]
 Bool = NDArray[np.bool_]
 Powers = Sequence[tuple[int, int]]
 
@@ -39,8 +40,8 @@ _COMPANY = 3
 _LEVEL = 0.1
 # No plane is known better than this.
 _FLOOR = 0.02
-# From this radius on, sums over windows are made from those over their neighbours.
-_WIDE = 8
+# From these radii on, windows are made of cells of so many pixels squared.
+_WIDE = {8: 2, 16: 4}
 # So many arrays of pixels are worked on together.
 _ARRAYS = 6
 
@@ -61,8 +62,10 @@ class Windows:
 
     @property
     def reach(self) -> int:
-        """How far from a pixel its value may depend on others, pixels."""
-        return 2 * max(self.radii) + 1
+        """How far from a pixel its value may depend on others, pixels; a multiple of all cells."""
+        size, radius = _cells(max(self.radii))
+        largest = max(_WIDE.values())
+        return -(-(2 * radius + 1) * size // largest) * largest
 
     @classmethod
     def for_step(cls, step: float, radii: tuple[int, ...] = RADII) -> "Windows":
@@ -104,15 +107,15 @@ def fit_planes(
     # A plane may deviate from the measurement by so much.
     allowed = np.where(trusted, _AGREES * np.sqrt(variance), np.inf).astype(np.float32)
     least, most = best - allowed, best + allowed
-    moments = [np.empty(value.shape) for _ in range(10)]
     for radius in windows.radii:
-        # A pixel's windows are centred up to a radius off it, and end at another.
-        start, stop = max(first - 2 * radius, 0), last + 2 * radius
-        own, heavy = measured[start:stop], weight[start:stop]
-        planes = _planes(own, heavy, radius, windows.factor, [part[: len(own)] for part in moments])
+        size, cells = _cells(radius)
+        # A pixel's windows are centred up to so many cells off its own, and end at as many more.
+        start = max(first // size - 2 * cells, 0) * size
+        stop = (-(-last // size) + 2 * cells) * size
+        planes = _planes(measured[start:stop], weight[start:stop], size, cells, windows.factor)
         for rows in bands(best.shape, channels=_ARRAYS):
             chosen = _Choice(*(part[rows] for part in (best, spread, least, most)))
-            _choose(planes, radius, rows.start + first - start, chosen)
+            _choose(planes, size * cells, rows.start + first - start, chosen)
     found = known & np.isfinite(spread)
     best[~found] = np.nan
     spread[~found] = np.inf
@@ -149,13 +152,28 @@ def understated(value: Float32, error: Float32, plane: Bool, windows: Windows = 
         plane.astype(np.uint8), np.ones(size), borderType=cv2.BORDER_CONSTANT, borderValue=0
     )
     places = np.flatnonzero(inside)
+    if not places.size:
+        return 1.0
     every = max(1, len(places) * size[0] ** 2 // _TOLD)
     middle = np.divmod(places[::every], value.shape[1])
-    y, x = (part.ravel() for part in np.mgrid[-radius : radius + 1, -radius : radius + 1])
-    around = middle[0][:, np.newaxis] + y, middle[1][:, np.newaxis] + x
-    used = _trusted(value, error, windows.near)[around]
-    weight = np.where(used, 1 / np.maximum(error[around].astype(np.float64) ** 2, 1e-12), 0)
-    measured = np.where(used, value[around], 0).astype(np.float64)
+    # With a margin, as a measurement is trusted by those around it.
+    y, x = np.mgrid[-radius - 1 : radius + 2, -radius - 1 : radius + 2]
+    around = tuple(
+        place[:, np.newaxis, np.newaxis] + off for place, off in zip(middle, (y, x), strict=True)
+    )
+    within = tuple(np.clip(place, 0, n - 1) for place, n in zip(around, value.shape, strict=True))
+    outside = (around[0] != within[0]) | (around[1] != within[1])
+    values, errors = np.where(outside, np.float32(np.nan), value[within]), error[within]
+    # One below the other: only their margins meet.
+    tall = (-1, values.shape[2])
+    trusted = _trusted(values.reshape(tall), errors.reshape(tall), windows.near)
+    used = trusted.reshape(values.shape)[:, 1:-1, 1:-1].reshape(len(values), -1)
+    values, errors = (
+        part[:, 1:-1, 1:-1].reshape(len(part), -1).astype(np.float64) for part in (values, errors)
+    )
+    y, x = (part[1:-1, 1:-1].ravel() for part in (y, x))
+    weight = np.where(used, 1 / np.maximum(errors**2, 1e-12), 0)
+    measured = np.where(used, values, 0)
     terms = np.stack([np.ones(len(x)), x / radius, y / radius], axis=-1)
     normal = np.einsum("nk,ki,kj->nij", weight, terms, terms) + 1e-6 * np.eye(3)
     right = np.einsum("nk,ki->ni", weight * measured, terms)
@@ -179,6 +197,13 @@ def _in_company(value: Float32, variance: Float32, near: float) -> Bool:
         company[here] += agrees
         company[there] += agrees
     return company >= _COMPANY
+
+
+def _cells(radius: int) -> tuple[int, int]:
+    """The cells that windows of a radius are made of: their size in pixels, and how many lie on
+    either side of the middle one."""
+    size = max((size for least, size in _WIDE.items() if radius >= least), default=1)
+    return size, round((2 * radius + 1 - size) / (2 * size))
 
 
 class _Planes(NamedTuple):
@@ -208,6 +233,18 @@ class _Planes(NamedTuple):
         if x and y:
             _added(variance, bc, x * y)
         return value, variance
+
+    def from_column(self, x: Float32) -> "_Planes":
+        """The same counted from (x, 0)."""
+        a, b, c, aa, ab, ac, bb, bc, cc = self
+        a, aa = a + x * b, aa + x * (ab + x * bb)
+        return _Planes(a, b, c, aa, ab + 2 * x * bb, ac + x * bc, bb, bc, cc)
+
+    def from_row(self, y: Float32) -> "_Planes":
+        """The same counted from (0, y)."""
+        a, b, c, aa, ab, ac, bb, bc, cc = self
+        a, aa = a + y * c, aa + y * (ac + y * cc)
+        return _Planes(a, b, c, aa, ab + y * bc, ac + 2 * y * cc, bb, bc, cc)
 
 
 def _added(total: Float32, part: Float32, sign: int) -> None:
@@ -249,84 +286,110 @@ def _choose(planes: _Planes, radius: int, first: int, chosen: _Choice) -> None:
         cv2.copyTo(variance, better.view(np.uint8), spread[here])
 
 
-def _planes(
-    value: Float64, weight: Float64, radius: int, factor: float, moments: list[Float64]
-) -> _Planes:
+def _planes(value: Float64, weight: Float64, size: int, cells: int, factor: float) -> _Planes:
     """The planes fitted to the windows around all pixels.
 
     Args:
-        factor: by how much they are known worse than from independent measurements.
-        moments: ten of (H, W), to work in.
+        size, cells: what windows are made of, as of `_cells`: those of a cell's pixels are the
+            same.
+        factor: by how much planes are known worse than from independent measurements.
     """
-    sums = _sums_by_kernels if radius < _WIDE else _sums_by_steps
     weighted = weight * value
-    powers = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    sums(weight, radius, powers, moments[:6])
-    sums(weighted, radius, powers[:3], moments[6:9])
-    sums(weighted * value, radius, powers[:1], moments[9:])
-    size = (2 * radius + 1, 2 * radius + 1)
     used = (weight > 0).astype(np.float32)
-    count = cv2.boxFilter(used, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    planes = _Planes(*(np.empty(value.shape, np.float32) for _ in range(9)))
-    for rows in bands(value.shape, channels=_ARRAYS):
-        _solve([part[rows] for part in moments], count[rows], factor, radius, rows, planes)
-    return planes
+    sums = [
+        *_window_sums(weight, size, cells, ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))),
+        *_window_sums(weighted, size, cells, ((0, 0), (1, 0), (0, 1))),
+        *_window_sums(weighted * value, size, cells, ((0, 0),)),
+        *_window_sums(used, size, cells, ((0, 0),)),
+    ]
+    found = _Planes(*(np.empty(sums[0].shape, np.float32) for _ in range(9)))
+    for rows in bands(sums[0].shape, channels=_ARRAYS):
+        _solve([part[rows] for part in sums], factor, size * cells, rows, found)
+    return found if size == 1 else _for_pixels(found, value.shape, size, cells)
 
 
-def _sums_by_kernels(image: Float64, radius: int, powers: Powers, sums: list[Float64]) -> None:
-    """Sums of the image times xᵃyᵇ over the windows around all pixels, x and y counted from
-    there."""
-    ramp = np.arange(-radius, radius + 1, dtype=np.float64)
-    kernels = [ramp**power for power in range(3)]
-    for (a, b), total in zip(powers, sums, strict=True):
-        cv2.sepFilter2D(
-            image, -1, kernels[a], kernels[b], dst=total, borderType=cv2.BORDER_CONSTANT
-        )
+def _for_pixels(found: _Planes, shape: tuple[int, ...], size: int, cells: int) -> _Planes:
+    """The same planes for each of the cells' pixels, counted as if it were the cell's middle."""
+    height, width = found.a.shape
+    # In radii, as the planes are.
+    offsets = ((np.arange(size) - (size - 1) / 2) / (size * cells)).astype(np.float32)
+    wide = (width * size, height)
+    parts = (cv2.resize(part, wide, interpolation=cv2.INTER_NEAREST) for part in found)
+    moved = _Planes(*(np.asarray(part, np.float32) for part in parts)).from_column(
+        np.tile(offsets, width)
+    )
+    planes = _Planes(*(np.empty((height, size, width * size), np.float32) for _ in found))
+    for row in range(size):
+        for part, own in zip(planes, moved.from_row(offsets[row : row + 1]), strict=True):
+            part[:, row] = own
+    own_rows, own_columns = map(slice, shape)
+    return _Planes(*(part.reshape(height * size, -1)[own_rows, own_columns] for part in planes))
 
 
-def _sums_by_steps(image: Float64, radius: int, powers: Powers, sums: list[Float64]) -> None:
-    """The same in a time that does not grow with the radius: from window to window it is what
-    enters that is added, and what leaves that is taken away."""
-    height, width = image.shape
-    size = (2 * radius + 1, 2 * radius + 1)
-    x = np.arange(width, dtype=np.float64) - width // 2
-    y = np.arange(height, dtype=np.float64)[:, np.newaxis] - height // 2
-    products = {(0, 0): image}
-    for (a, b), total in zip(powers, sums, strict=True):
-        if a:
-            products[a, b] = products[a - 1, b] * x
-        elif b:
-            products[a, b] = products[a, b - 1] * y
-        border = cv2.BORDER_CONSTANT
-        cv2.boxFilter(products[a, b], -1, size, dst=total, normalize=False, borderType=border)
-    # From about the picture's middle to about each window's, the highest powers first.
-    for rows in bands(image.shape, _ARRAYS):
-        part = {power: total[rows] for power, total in zip(powers, sums, strict=True)}
-        down = y[rows]
-        for a, b in reversed(powers):
-            if (a, b) == (1, 1):
-                part[1, 1] -= down * part[1, 0]
-                part[1, 1] -= x * (part[0, 1] - down * part[0, 0])
-            elif a:
-                part[a, b] -= x * part[a - 1, b]
-                if a == 2:
-                    part[a, b] -= x * (part[1, 0] - x * part[0, 0])
-            elif b:
-                part[a, b] -= down * part[a, b - 1]
-                if b == 2:
-                    part[a, b] -= down * (part[0, 1] - down * part[0, 0])
+def _window_sums(image: Floats, size: int, cells: int, powers: Powers) -> list[Floats]:
+    """Sums of the image times xᵃyᵇ over the windows around all cells, x and y counted from there
+    in pixels."""
+    border = cv2.BORDER_CONSTANT
+    if size == 1:
+        ramp = np.arange(-cells, cells + 1, dtype=np.float64)
+        kernels = [ramp**power for power in range(3)]
+        return [
+            np.asarray(cv2.sepFilter2D(image, -1, kernels[a], kernels[b], borderType=border))
+            for a, b in powers
+        ]
+    moments = _moments(image, size, powers)
+    height, width = moments[0, 0].shape
+    # All about the picture's middle, to be summed up, and then each about its own window's.
+    x = size * (np.arange(width) - width / 2)
+    y = size * (np.arange(height) - height / 2)[:, np.newaxis]
+    _count_from(moments, -x, -y)
+    window = (2 * cells + 1, 2 * cells + 1)
+    for power, own in moments.items():
+        total = cv2.boxFilter(own, -1, window, normalize=False, borderType=border)
+        moments[power] = np.asarray(total, np.float64)
+    _count_from(moments, x, y)
+    return [moments[power] for power in powers]
+
+
+def _moments(image: Floats, size: int, powers: Powers) -> dict[tuple[int, int], Float64]:
+    """Sums of the image times xᵃyᵇ over each cell, x and y counted from its middle in pixels."""
+    height, width = (-(-length // size) for length in image.shape)
+    if (height * size, width * size) != image.shape:
+        rest = [(0, n * size - own) for n, own in zip((height, width), image.shape, strict=True)]
+        image = np.pad(image, rest)
+    offsets = np.arange(size) - (size - 1) / 2
+    across = [np.zeros((height * size, width)) for _ in range(1 + max(a for a, _ in powers))]
+    for column, x in enumerate(offsets):
+        for a, total in enumerate(across):
+            total += x**a * image[:, column::size]
+    moments = {power: np.zeros((height, width)) for power in powers}
+    for row, y in enumerate(offsets):
+        for (a, b), total in moments.items():
+            total += y**b * across[a][row::size]
+    return moments
+
+
+def _count_from(moments: dict[tuple[int, int], Float64], x: Float64, y: Float64) -> None:
+    """Have moments, of all powers up to the highest, counted from (x, y)."""
+    total = moments[0, 0]
+    if (2, 0) in moments:
+        moments[2, 0] -= x * (2 * moments[1, 0] - x * total)
+        moments[1, 1] -= x * moments[0, 1] + y * (moments[1, 0] - x * total)
+        moments[0, 2] -= y * (2 * moments[0, 1] - y * total)
+    if (1, 0) in moments:
+        moments[1, 0] -= x * total
+        moments[0, 1] -= y * total
 
 
 def _solve(
-    moments: list[Float64],
-    count: NDArray[Any],
+    sums: list[Floats],
     factor: float,
     radius: int,
     rows: slice,
     planes: _Planes,
 ) -> None:
     """The planes of some rows from the sums over their windows, which are overwritten."""
-    w, wx, wy, wxx, wxy, wyy, wv, wvx, wvy, wvv = moments
+    w, wx, wy, wxx, wxy, wyy, wv, wvx, wvy, wvv, count = sums
     w += 1e-9
     wxx += _LEVEL
     wyy += _LEVEL

@@ -23,6 +23,10 @@ LEAST_ANGLE = np.radians(10.0)
 _LEAST_WEIGHT = 1e-3
 # Outside any picture.
 _FAR = -1e6
+# A pixel has slipped if its displacement is further than this, pixels, from all but one of the
+# eight around it, and at least six of these lie within half as much of their median.
+_SLIPPED, _FRIENDS, _AGREED = 0.5, 1, 6
+_AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x])
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,40 @@ def _scatter(
         count[known] += 1
         square[known] += precision * (nx * x + ny * y + d) ** 2
     return np.asarray(square * (count > 2) / np.maximum(count - 2, 1), np.float64)
+
+
+def without_slips(found: WarpMap) -> WarpMap:
+    """W with what the pixels around agree on where a pixel is off them all.
+
+    Noise may choose the wrong interval between two frames, and once in a thousand pixels does so
+    in all passes in the same sense: nothing in the pixel's own measurements then tells. But no
+    surface is a single pixel large.
+
+    Args:
+        found: as measured, not filled in.
+
+    Returns:
+        Median displacement and error of the pixels around, where a pixel has slipped.
+    """
+    height, width = found.error.shape
+    here = identity_map(height, width)
+    displacement = np.nan_to_num(found.warp - here, nan=_FAR)
+    usual = [cv2.medianBlur(np.ascontiguousarray(part), 3) for part in cv2.split(displacement)]
+    off = np.hypot(*(part - own for part, own in zip(cv2.split(displacement), usual, strict=True)))
+    # Where enough of them agree, the median of all nine lies among them.
+    off[(off <= _SLIPPED / 2) | np.isinf(found.error)] = 0
+    off[[0, -1]], off[:, [0, -1]] = 0, 0
+    places = np.argwhere(off)
+    around = tuple((places[:, np.newaxis] + _AROUND).transpose(2, 0, 1))
+    own, others = displacement[tuple(places.T)][:, np.newaxis], displacement[around]
+    middle = np.median(others, axis=1)
+    agreed = np.linalg.norm(others - middle[:, np.newaxis], axis=-1) <= _SLIPPED / 2
+    friends = np.linalg.norm(others - own, axis=-1) <= _SLIPPED
+    slipped = (agreed.sum(axis=1) >= _AGREED) & (friends.sum(axis=1) <= _FRIENDS)
+    warp, error, at = found.warp.copy(), found.error.copy(), tuple(places[slipped].T)
+    warp[at] = here[at] + middle[slipped]
+    error[at] = np.median(found.error[around], axis=1)[slipped]
+    return WarpMap(warp, error)
 
 
 def pass_angles(passes: list[Pass]) -> list[tuple[int, int, float]]:

@@ -11,7 +11,7 @@ from shadowtool.core.epipole import Epipole, find_epipole
 from shadowtool.core.parallax import measure_parallax
 from shadowtool.core.plane_fits import Windows, fit_planes
 from shadowtool.core.shadow_lines import line_speed
-from shadowtool.core.warp_map import Pass, WarpMap, identity_map, intersect
+from shadowtool.core.warp_map import Pass, WarpMap, identity_map, intersect, without_slips
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.run import Progress, no_progress
 
@@ -63,7 +63,7 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     for done, (rows, part) in enumerate(ordered_map(band, cuts, jobs), start=1):
         whole.warp[rows], whole.error[rows] = part.warp, part.error
         progress(done, len(cuts))
-    return Solved(whole, epipole)
+    return Solved(without_slips(whole), epipole)
 
 
 def _towards(

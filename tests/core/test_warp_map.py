@@ -19,6 +19,7 @@ from shadowtool.core.warp_map import (
     resample,
     sample,
     to_st_map,
+    without_slips,
 )
 from tests.core.test_shadow_lines import SCENE, edge_times, lines_of
 from tests.scene import Sweep
@@ -133,6 +134,70 @@ def test_what_is_unknown_spreads_to_no_others(shape: tuple[int, ...], shift: flo
     # What lies midway is half of either.
     assert bad.sum() == (4 if shift == 0.5 else 2)
     assert found[np.isfinite(found)] == pytest.approx(0.5, abs=1e-6)
+
+
+def bent(height: int = 30, width: int = 40) -> WarpMap:
+    """A plane with something on it that moves W by three pixels and more."""
+    warp = identity_map(height, width)
+    warp[8:20, 10:25, 0] += 3 + 0.1 * np.arange(15, dtype=np.float32)
+    return WarpMap(warp, np.full((height, width), 0.05, np.float32))
+
+
+def same_maps(one: WarpMap, other: WarpMap) -> bool:
+    return np.array_equal(one.warp, other.warp, equal_nan=True) and np.array_equal(
+        one.error, other.error
+    )
+
+
+def test_a_pixel_off_all_around_it_that_agree_takes_their_displacement() -> None:
+    true = bent()
+    found = WarpMap(true.warp.copy(), true.error.copy())
+    slips = [(4, 5), (25, 30), (14, 17)]
+    for row, column in slips:
+        found.warp[row, column] += (1.2, -0.9)
+        found.error[row, column] = 0.3
+    # Two that slipped together.
+    found.warp[4, 33:35] += (0.0, 2.0)
+    mended = without_slips(found)
+    assert mended.warp == pytest.approx(true.warp, abs=0.06)
+    assert np.array_equal(mended.error, true.error)
+    assert found.warp[4, 5, 0] == pytest.approx(6.2)
+
+
+def test_edges_and_corners_are_no_slips() -> None:
+    found = bent()
+    assert same_maps(without_slips(found), found)
+
+
+def test_of_a_line_of_single_pixels_no_more_than_the_ends_can_be_taken_for_slips() -> None:
+    found = bent()
+    found.warp[2:28, 32, 1] -= 4
+    found.warp[24, 4:20] += (1.0, 1.0)
+    mended = without_slips(found)
+    changed = np.argwhere((mended.warp != found.warp).any(axis=-1))
+    assert {tuple(place) for place in changed.tolist()} <= {(2, 32), (27, 32), (24, 4), (24, 19)}
+
+
+def test_where_neighbours_disagree_nothing_is_known_of_slips() -> None:
+    rng = np.random.default_rng(0)
+    found = bent()
+    found.warp[:] += rng.normal(scale=1, size=found.warp.shape).astype(np.float32)
+    mended = without_slips(found)
+    assert (mended.warp != found.warp).any(axis=-1).mean() < 0.002
+
+
+def test_what_is_unknown_is_left_and_is_no_neighbour() -> None:
+    found = bent()
+    found.warp[5, 5], found.error[5, 5] = np.nan, np.inf
+    found.warp[25, 5] += 2
+    found.warp[24, 4:6], found.error[24, 4:6] = np.nan, np.inf
+    found.warp[26, 5], found.error[26, 5] = np.nan, np.inf
+    assert same_maps(without_slips(found), found)
+    nothing = WarpMap(np.full((9, 9, 2), np.nan, np.float32), np.full((9, 9), np.inf, np.float32))
+    assert same_maps(without_slips(nothing), nothing)
+    for shape in ((1, 1), (1, 9), (2, 2)):
+        small = WarpMap(identity_map(*shape), np.zeros(shape, np.float32))
+        assert same_maps(without_slips(small), small)
 
 
 def test_the_identity_resamples_to_the_same_picture() -> None:

@@ -29,6 +29,9 @@ _RARE, _TILES, _HEAVY = (0.9, 1.6448536), 8, 1.2
 # Ground is lit that is brighter than the first part of what it was at most, and something dark has
 # passed it if it was darker than the second; in so many tiles at least.
 _LIGHT, _SHADE, _LEAST_TILES = 0.8, 0.6, 4
+# If more than the second part of it was darker than the first part of what it was at most, before
+# or after, penumbrae are what rare pixels are off by.
+_HALF_LIT, _FEW = 0.9, 0.06
 _LEVELS = 12
 _GRID = 10_000
 _SAMPLES = 8
@@ -268,7 +271,7 @@ def _heaviness(pairs: list[tuple[Float32, Float32]], share: float, noise: NoiseM
 
 def _renewal(frames: list[Float32], noise: NoiseModel) -> Float64:
     """How many times as far as by this model's noise ground is off what it was, (3,), after
-    something dark has passed it; 1 where nothing did.
+    something dark has passed it; 1 where nothing did, or did so slowly that little tells.
 
     Args:
         frames: thinned, spread over the take in its order.
@@ -283,6 +286,10 @@ def _renewal(frames: list[Float32], noise: NoiseModel) -> Float64:
         first, last = lit.argmax(axis=0), len(stack) - 1 - lit[::-1].argmax(axis=0)
         number = np.arange(len(stack))[:, np.newaxis, np.newaxis]
         passed = (dark & (number > first) & (number < last)).any(axis=0)
+        ends = [np.take_along_axis(gray, at[np.newaxis], axis=0)[0] for at in (first, last)]
+        half_lit = np.minimum(*ends) < _HALF_LIT * brightest
+        if np.count_nonzero(half_lit & passed) > _FEW * np.count_nonzero(passed):
+            return np.ones(3)
         before, after = (
             np.take_along_axis(stack, which[np.newaxis, ..., np.newaxis], axis=0)[0]
             for which in (first, last)

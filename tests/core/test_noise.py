@@ -129,6 +129,20 @@ def test_what_passes_makes_no_noise(light: float) -> None:
     assert model.sigma(np.full(3, 0.3)) == pytest.approx([0.005] * 3, rel=0.25)
 
 
+@pytest.mark.parametrize("pace", [0.8, 1.5])
+def test_a_soft_shadow_that_passes_slowly_makes_no_noise(pace: float) -> None:
+    rng = np.random.default_rng(5)
+    clean = rng.uniform(0.2, 0.5, (240, 320, 3))
+    shots = []
+    for number in range(12):
+        # Narrow stripes over a quarter of the picture; most of each is penumbra.
+        away = np.abs((np.arange(320) - pace * number) % 20 - 10)
+        light = np.ones((240, 320, 1))
+        light[:60] = 1 - 0.75 * np.clip(1.5 - away / 4, 0, 1)[:, np.newaxis]
+        shots.append(clean * light + 0.005 * rng.normal(size=clean.shape))
+    assert model_of(shots).sigma(np.full(3, 0.3)) == pytest.approx([0.005] * 3, rel=0.25)
+
+
 @pytest.mark.parametrize("moving", [False, True])
 def test_normal_noise_is_not_taken_for_rare_and_large(moving: bool) -> None:
     shots = take(24, moving=moving)

@@ -28,7 +28,13 @@ _COLUMNS = 320
 _ON_LINE, _TOLERANCE = 4.0, 0.01
 # Between these logarithms of S/L shadow is looked for, on ground that is so many times as bright as
 # its noise. It is black if so many times as many samples are as have any one ratio.
-_DEEPEST, _LIGHTEST, _CLEAR, _BLACK = 4.0, -0.25, 8.0, 2.0
+_DEEPEST, _LIGHTEST, _CLEAR, _BLACK = 5.0, -0.25, 8.0, 2.0
+# Of so many ratios that are frequent, each with what differs from it by this logarithm, and none
+# nearer to another than so many bins.
+_FREQUENT, _ALIKE, _BINS = 4, 0.1, 8
+# Ratios of shadow scatter by no more than noise and this part; and noise that widens a peak lowers
+# it by so much at most.
+_SCATTER, _LOWERED = 0.03, 2.0
 # A take whose shadow darkens more of the picture than this is that of a card waved over a scene.
 _MOST, _SHADED, _AT_ONCE = 0.5, 0.5, 0.2
 # Candidates for L are every so many of a pixel's samples, dark to bright.
@@ -139,8 +145,9 @@ def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float3
     frequent than those a little above and below.
 
     Shadow keeps the ground's texture, so its ratio is the same everywhere; a figure's is not, and
-    in a penumbra all ratios occur. Of a shadow that is all but black noise leaves no ratio, but
-    then more samples are black than have any one.
+    in a penumbra all ratios occur. So ratios of shadow scatter in no channel by more than noise,
+    where those of a figure scatter as widely as they are looked at. Of a shadow that is all but
+    black noise leaves no ratio, but then more samples are black than have any one.
     """
     everywhere = np.arange(stack.shape[2])
     bright = _ranked(stack, ascending[int(0.85 * (len(stack) - 1))], everywhere)
@@ -149,21 +156,42 @@ def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float3
     part = stack.sum(axis=1) / np.where(clear, light, 1)
     difference = np.where(clear, np.log(np.maximum(part, 1e-4)), 1)
     # Beyond what is looked for, too: it is next to some of that.
-    counts, edges = np.histogram(difference, bins=170, range=(-_DEEPEST, 0.25))
+    counts, edges = np.histogram(difference, bins=210, range=(-_DEEPEST, 0.25))
     excess = _smoothed(counts, 11) - _smoothed(counts, 45)
     excess[(counts == 0) | (edges[1:] >= _LIGHTEST)] = -np.inf
-    peak = int(np.argmax(excess))
-    alike = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2) < 0.1
+    found, best, usual = np.full(3, 0.25, np.float32), 0.0, 0.0
+    for _ in range(_FREQUENT):
+        peak = int(np.argmax(excess))
+        if excess[peak] <= 0:
+            break
+        alike = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2) < _ALIKE
+        if alike.sum() >= 20:
+            ratio, scatter, noisy = _told(stack, bright, alike, noise)
+            lowered = min(float(np.hypot(1, noisy / _ALIKE)), _LOWERED)
+            if (weight := excess[peak] * lowered / scatter) > best:
+                found, best, usual = ratio, weight, alike.sum() / scatter
+        excess[max(peak - _BINS, 0) : peak + _BINS + 1] = -np.inf
     black = difference <= -_DEEPEST
-    if black.sum() > _BLACK * alike.sum():
-        alike = black
-    if alike.sum() < 20:
-        return np.full(3, 0.25, np.float32)
-    time, pixel = np.nonzero(alike)
+    if black.sum() > max(_BLACK * usual, 20):
+        found, *_ = _told(stack, bright, black, noise)
+    return found
+
+
+def _told(
+    stack: Float32, bright: Float32, chosen: Bool, noise: NoiseModel
+) -> tuple[Float32, float, float]:
+    """The ratio of the chosen samples, (T, N), to what is bright, (3,); how many times as much as
+    noise and materials explain it scatters, at least 1; and what part of it is noise."""
+    time, pixel = np.nonzero(chosen)
+    own, light = stack[time, :, pixel], bright[:, pixel].T
     # A channel may be black where the colour is not.
-    light = bright[:, pixel].T
-    ratios = stack[time, :, pixel] / np.where(light > 0, light, 1)
-    return np.asarray(np.clip(np.median(ratios, axis=0), 0, 0.9), np.float32)
+    ratios = own / np.where(light > 0, light, 1)
+    logarithm = np.log(np.maximum(ratios, 1e-4))
+    off = np.median(np.abs(logarithm - np.median(logarithm, axis=0)), axis=0) / 0.6745
+    noisy = np.median(noise.sigma(own) / np.maximum(own, np.float32(1e-4)), axis=0)
+    scatter = max(float(np.median(off / np.hypot(noisy, _SCATTER))), 1.0)
+    ratio = np.asarray(np.clip(np.median(ratios, axis=0), 0, 0.9), np.float32)
+    return ratio, scatter, float(np.median(noisy))
 
 
 def _smoothed(counts: NDArray[np.integer], bins: int) -> NDArray[np.float64]:

@@ -27,6 +27,7 @@ ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH].astype(float)
 # Head, shirt, trousers, shoes, from the top, as parts of the height.
 MANY = ((0.2, (0.55, 0.33, 0.24)), (0.6, (0.10, 0.35, 0.75)), (0.95, (0.75, 0.7, 0.1)))
 DARK = ((0.2, (0.30, 0.16, 0.10)), (0.6, (0.018, 0.018, 0.022)), (0.95, (0.03, 0.026, 0.024)))
+VELVET = ((1.0, (0.004, 0.004, 0.004)),)
 Walk = Callable[[int], float]
 Clothes = tuple[tuple[float, tuple[float, float, float]], ...]
 
@@ -111,6 +112,7 @@ def shoot(name: str) -> Shoot:
         "pausing": lambda: Shoot(pausing),
         "dark clothes": lambda: Shoot(about_the_middle, DARK, shade=middle_shade()),
         "dark clothes right across": lambda: Shoot(steadily, DARK),
+        "all but black clothes": lambda: Shoot(steadily, VELVET),
         "shade in most frames": lambda: Shoot(steadily, shade=lasting_shade()),
         "empty": lambda: Shoot(None),
     }
@@ -131,6 +133,7 @@ TAKES = [
     "pausing",
     "dark clothes",
     "dark clothes right across",
+    "all but black clothes",
     "shade in most frames",
 ]
 
@@ -162,6 +165,30 @@ def test_the_lines_are_those_of_the_ground(name: str) -> None:
     assert np.mean(lit < 0.05) > 0.97
     shadow = np.abs(np.log(background.shadow / SCENE.shadow)).max(axis=-1)
     assert np.mean(shadow < 0.15) > 0.95
+
+
+@pytest.mark.parametrize("sky", [0.12, 0.07, 0.04])
+def test_a_large_figure_in_one_colour_is_no_deep_shadow(sky: float) -> None:
+    """On ground of few colours a plain figure's ratio to it is as frequent as shadow's."""
+    rng = np.random.default_rng(0)
+    lit = np.where((COLUMNS // 20 + ROWS // 20) % 2 == 0, 0.35, 0.3)[..., None]
+    lit = (lit * np.array([1.05, 1.0, 0.9])).astype(np.float32)
+    ratio = sky * np.array([0.8, 1.0, 1.4])
+    frames = []
+    for number in range(0, FRAMES, 2):
+        x = steadily(number)
+        beta = shadow_beta(x)[..., None]
+        image = lit * (ratio + beta * (1 - ratio))
+        alpha = figure_alpha(x)[..., None] > 0.5
+        shading = np.exp(0.12 * np.sin((COLUMNS - x) / 4))[..., None]
+        image = np.where(alpha, np.array([0.07, 0.12, 0.27]) * shading, image)
+        noise = np.sqrt(5e-5 * image + 5e-6) * rng.normal(size=image.shape)
+        frames.append((image + noise).astype(np.float32))
+    background = find_background(frames, NoiseModel(np.full(3, 5e-5), np.full(3, 5e-6)))
+    assert background is not None
+    below = (ROWS > 100) & (COLUMNS > 60) & (COLUMNS < 180)
+    found = np.median((background.shadow / background.lit)[below], axis=0)
+    assert found == pytest.approx(ratio, rel=0.15)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,9 @@ from typing import TypeVar
 
 import cv2
 
+# No machine has a number of processors with so many digits.
+_DIGITS = 7
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -20,7 +23,7 @@ Result = TypeVar("Result")
 def available_cpus() -> int:
     """The CPUs that this process may use: what Slurm granted, or the affinity mask."""
     granted = os.environ.get("SLURM_CPUS_PER_TASK", "")
-    if granted.isascii() and granted.isdigit() and int(granted) > 0:
+    if granted.isascii() and granted.isdigit() and 0 < len(granted) < _DIGITS and int(granted) > 0:
         return int(granted)
     return len(os.sched_getaffinity(0))
 

@@ -28,7 +28,8 @@ def _crop(ctx: click.Context, parameter: click.Parameter, value: str | None) -> 
 @transfer_option
 @click.option(
     "--start",
-    type=int,
+    type=click.IntRange(-(10**9), 10**9),
+    metavar="INTEGER",
     help="Number of the first frame. Default: 1001 for a movie or camera, a sequence keeps its"
     " own. --frames goes by it in a movie, and by a sequence's own numbers.",
 )
@@ -36,7 +37,7 @@ def _crop(ctx: click.Context, parameter: click.Parameter, value: str | None) -> 
 @click.option("--scale", type=float, default=1.0, metavar="FACTOR", help="Resize, after --crop.")
 @format_option
 @click.option("--strict", is_flag=True, help="Fail if the camera moved.")
-@click.option("--device", type=click.IntRange(min=0), metavar="N", help="Record from a camera.")
+@click.option("--device", type=click.IntRange(0, 999), metavar="N", help="Record from a camera.")
 @click.option("--seconds", type=float, metavar="T", help="How long to record.")
 @step_command
 def command(source: str | None, output: Path, **options: Any) -> list[Any]:

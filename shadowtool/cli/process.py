@@ -125,7 +125,9 @@ def _is_of_memory(error: Exception) -> bool:
     if type(error).__module__ == "cv2":
         return getattr(error, "code", 0) == _OPENCV_NO_MEMORY
     no_thread = isinstance(error, RuntimeError) and "start new thread" in str(error)
-    return no_thread or isinstance(error, MemoryError)
+    # Of a library that finds no room: "failed to map segment from shared object".
+    no_room = isinstance(error, ImportError) and "map segment" in str(error)
+    return no_thread or no_room or isinstance(error, MemoryError)
 
 
 def _say(message: str) -> None:

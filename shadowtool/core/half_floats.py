@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 Float16 = NDArray[np.float16]
 
+LARGEST_HALF = 65504.0
 _INFINITE = 0x7C00
 _NOTHING = np.zeros(1)
 # Half of the unit that a single float's mantissa is rounded to, to keep 12 of its 23 bits.
@@ -31,7 +32,7 @@ def to_half(values: NDArray[np.floating]) -> Float16:
     halfs = rounded(values)
     if all_finite(halfs):
         return halfs
-    return np.asarray(np.clip(values, -65504, 65504), np.float16)
+    return np.asarray(np.clip(values, -LARGEST_HALF, LARGEST_HALF), np.float16)
 
 
 def rounded(values: NDArray[np.floating]) -> Float16:

@@ -128,6 +128,12 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
 
 
+def require_readable(path: Path) -> None:
+    """Raise as `read_bytes` does where the file can't be opened."""
+    with _reading(path), path.open("rb"):
+        pass
+
+
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[None]:
     try:
@@ -163,6 +169,12 @@ def write_bytes(path: Path, data: bytes | memoryview) -> None:
 
 def _name() -> str:
     return f"{threading.get_ident():x}-{next(_counter)}"
+
+
+def real(path: Path) -> Path:
+    """The path without links, as far as it has any that lead somewhere."""
+    # Path.resolve raises an error of its own where a link leads to itself.
+    return Path(os.path.realpath(path))
 
 
 def is_file(path: Path) -> bool:

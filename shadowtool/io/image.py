@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 from shadowtool.core.half_floats import to_float
 from shadowtool.core.half_floats import to_half as to_half
 from shadowtool.core.transfer import TRANSFERS
-from shadowtool.errors import DamagedFileError, InputError, ShadowtoolError
+from shadowtool.errors import DamagedFileError, InputError, RetryError, ShadowtoolError
 from shadowtool.io.files import (
     Content,
     read_content,
+    require_readable,
     unchanging,
     write_bytes,
 )
@@ -166,6 +167,8 @@ class Image:
         if len(only) == 1 and only[0].ndim == 2:
             return _unit(only[0])
         colour = self.layers.get("RGB", self.layers.get("RGBA"))
+        if colour is not None and colour.ndim == 2:
+            return _unit(colour)
         grey = None if colour is None else _grey(colour)
         if grey is not None:
             return grey
@@ -188,7 +191,7 @@ class Image:
         for layer, values in self.layers.items():
             if layer == name and values.ndim == 2:
                 return _unit(values)
-            if layer in ("RGB", "RGBA") and len(name) == 1 and name in layer:
+            if layer in ("RGB", "RGBA") and values.ndim == 3 and len(name) == 1 and name in layer:
                 return _unit(_one_channel(values, layer.index(name)))
         raise InputError(f"{self.path}: has no channel {name}, only {', '.join(self.layers)}")
 
@@ -349,7 +352,7 @@ def encode_exr(
         path: what they are for, to be named if they can't be made.
 
     Raises:
-        ShadowtoolError: they can't be made.
+        RetryError: there is no memory for it.
     """
     arrays = {}
     for name, values in channels.items():
@@ -377,7 +380,8 @@ def encode_exr(
         with _zip_level.at(_QUICK if quick else _USUAL):
             OpenEXR.File(attributes, arrays).write(buffer)
     except RuntimeError as error:
-        raise ShadowtoolError(f"{path}: cannot be encoded: {error}") from None
+        # Arrays are as they have to be: what fails is memory.
+        raise RetryError(f"{path}: cannot be encoded: {error}; give a smaller --jobs") from None
     return buffer.getbuffer()
 
 
@@ -455,6 +459,8 @@ def _open_exr(
             source.seek(0)
         return OpenEXR.File(source, separate_channels=separate, header_only=header_only)
     except _EXR_FAULTS as error:
+        # It says the same of a file that it can't open.
+        require_readable(path)
         raise DamagedFileError(
             f"{path}: no EXR, or its header is damaged; write the frame again"
         ) from error

@@ -7,6 +7,7 @@ import contextlib
 import fcntl
 import json
 import logging
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
@@ -309,16 +310,32 @@ def _require_st_map(image: Image, st_map: NDArray[np.float32]) -> None:
 def read_record(path: Path) -> dict[str, Any]:
     """A JSON record of ours; empty if there is none, or none that can be read."""
     try:
-        record = json.loads(path.read_bytes())
+        record = json.loads(path.read_bytes(), parse_constant=_finite, parse_float=_finite)
     except (OSError, ValueError, RecursionError):
         return {}
     return record if isinstance(record, dict) else {}
 
 
+def _finite(number: str) -> float:
+    """A number of a record; what is no number makes the record one that can't be read."""
+    value = float(number)
+    if not math.isfinite(value):
+        raise ValueError(f"{number} is no number")
+    return value
+
+
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
-    """Write a record so that the same content gives the same bytes."""
-    text = json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    """Write a record so that the same content gives the same bytes; what is no number, null."""
+    text = json.dumps(_plain(record), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
     write_bytes(path, text.encode("utf-8", "replace") + b"\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(own) for key, own in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(own) for own in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @contextlib.contextmanager

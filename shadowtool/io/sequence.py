@@ -17,7 +17,7 @@ from fileseq.frameset import FrameSet
 
 from shadowtool.choices import Missing
 from shadowtool.errors import InputError, OptionError
-from shadowtool.io.files import is_file
+from shadowtool.io.files import is_file, real
 from shadowtool.io.image import EXR, PNG
 
 Frame = int | Decimal
@@ -162,9 +162,9 @@ def parse_frames(text: str) -> list[Frame]:
         parts = [part.strip() for part in text.replace(":", "x").split(",")]
         whole = not any(re.search(r"\s", part) for part in parts)
         frames = _frames(FrameSet(",".join(parts))) if whole else []
-    except (FileSeqException, ValueError, TypeError):
+    except (FileSeqException, ValueError, TypeError, ArithmeticError):
         frames = []
-    if not frames:
+    if not frames or not all(frame_number(str(frame)) is not None for frame in frames):
         raise OptionError(
             f"--frames {_short(text)}: not a frame range; write 1001-1048, 1001-1048x2 or 1,5,9-20"
         )
@@ -227,7 +227,7 @@ def _sequences(folder: Path) -> list[_Found]:
             if len(fractional) == 1 and _fractions(_frames(fractional[0].frameSet() or ())):
                 found = fractional
         return [_from_fileseq(folder, s) for s in sorted(found, key=str)]
-    except FileSeqException as error:
+    except (FileSeqException, ArithmeticError) as error:
         raise InputError(f"{folder}: its frames can't be numbered: {error}") from None
 
 
@@ -246,7 +246,7 @@ def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
     frames = sorted(_frames(frame_set))
     files = {frame: folder / sequence.frame(frame) for frame in frames}
     digits = max(sequence.zfill(), 1)
-    name = base.rstrip("._- ") or folder.resolve().name
+    name = base.rstrip("._- ") or real(folder).name
     pattern = os.fspath(folder / f"{base}{'#' * digits}{suffix}")
     return _Found(Sequence(name, pattern, files), base, suffix, digits)
 
@@ -257,7 +257,7 @@ def _single(path: Path) -> Sequence:
     number = re.fullmatch(r"(.*)[._](-?\d+)", path.stem) or re.fullmatch(r"(.*?)-?(\d+)", path.stem)
     if number is None:
         return Sequence(path.stem, os.fspath(path), {1: path})
-    name = number[1] or path.resolve().parent.name
+    name = number[1] or real(path).parent.name
     return Sequence(name, os.fspath(path), {int(number[2]): path})
 
 
@@ -274,7 +274,7 @@ def _of_pattern(path: Path, role: str) -> Sequence:
             for item in _sequences(path.parent)
             if item.digits and (item.base, item.suffix) == (base, suffix)
         ]
-    except (FileSeqException, ValueError, OSError):
+    except (FileSeqException, ValueError, ArithmeticError, OSError):
         found = []
     if not found:
         raise InputError(f"{_short(os.fspath(path))}: no frames for the {role} are there")

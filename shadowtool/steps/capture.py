@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Format
 from shadowtool.core import camera_motion
-from shadowtool.core.half_floats import not_finite
+from shadowtool.core.half_floats import LARGEST_HALF, not_finite
 from shadowtool.core.noise import NoiseSamples, noise_levels
 from shadowtool.core.shadow_time import luminance
 from shadowtool.core.transfer import TRANSFERS
@@ -24,7 +24,7 @@ from shadowtool.errors import (
     OutputExistsError,
     ReshootError,
 )
-from shadowtool.io.files import new_folders
+from shadowtool.io.files import new_folders, real
 from shadowtool.io.image import EXR, PNG, Header, to_code, to_half, write_exr, write_png
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame, frame_file, frame_range
@@ -55,7 +55,7 @@ _MOVED = 0.25
 _DOUBLED = 0.05
 _GRID = 8
 # Integer code values from here on are clipped; floating point ends only where halfs do.
-_CLIPPED_CODE, _LARGEST_HALF = 0.999, 65504.0
+_CLIPPED_CODE = 0.999
 # The part of the record that is shown when the step is done.
 _FIGURES = ("transfer", "bits", "frame_rate", "camera_motion", "clipped", "dropped", "doubled")
 
@@ -128,7 +128,7 @@ def capture(
     taking = _Taking(opened, recipe, output, name, suffix, transfer, crop, size, run)
     mark = recipe.fingerprint([opened.fingerprint])
     refuse_other_step("capture", output, run)
-    if opened.folder is not None and output.resolve() == opened.folder.resolve():
+    if opened.folder is not None and real(output) == real(opened.folder):
         raise OptionError(f"{output}: is the folder of the frames to capture; give another -o")
     if run.resume and (kept := taking.kept(mark)) is not None:
         if strict:
@@ -306,7 +306,7 @@ class _Taking:
                 write_png(path, to_code(linear), provenance)
         gray = self._prepared(linear)
         shift = None if reference is None else camera_motion.shift(reference, gray, self.size[0])
-        top = _LARGEST_HALF if self.source.bits is None else _CLIPPED_CODE
+        top = LARGEST_HALF if self.source.bits is None else _CLIPPED_CODE
         clipped = float((loaded.values >= top).any(axis=-1).mean())
         bad = not_finite(linear)
         count = 0 if bad is None else int(np.count_nonzero(bad))
@@ -321,10 +321,7 @@ class _Taking:
         if (crop := self.crop) is not None:
             values = values[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
         if (values.shape[1], values.shape[0]) != self.size:
-            smaller = self.size[0] < values.shape[1]
-            method = cv2.INTER_AREA if smaller else cv2.INTER_CUBIC
-            whole = np.ascontiguousarray(values)
-            values = np.asarray(cv2.resize(whole, self.size, interpolation=method), np.float32)
+            values = _resized(np.ascontiguousarray(values), self.size)
         return values
 
     def kept(self, mark: str) -> Result | None:
@@ -432,3 +429,23 @@ def _moved(name: str, motion: dict[str, Any]) -> str:
         f" {motion.get('largest')} pixels in frame {motion.get('largest_at')};"
         " stabilise the take or shoot it again"
     )
+
+
+def _resized(image: Float32, size: tuple[int, int]) -> Float32:
+    """A picture (H, W, 3) at another size (width, height). What is not finite makes nothing else
+    so: pixels around it are made of those that are."""
+    method = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_CUBIC
+    bad = not_finite(image)
+    if bad is None:
+        return np.asarray(cv2.resize(image, size, interpolation=method), np.float32)
+    good = (~bad).astype(np.float32)
+    whole = np.where(bad[..., np.newaxis], np.float32(0), image)
+    values, weight = (
+        np.asarray(cv2.resize(part, size, interpolation=method), np.float32)
+        for part in (whole, good)
+    )
+    lost = cv2.resize(good, size, interpolation=cv2.INTER_NEAREST) == 0
+    lost |= weight < 0.5
+    values /= np.where(lost, np.float32(1), weight)[..., np.newaxis]
+    values[lost] = np.nan
+    return values

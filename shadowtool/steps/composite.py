@@ -17,6 +17,7 @@ from shadowtool.core.filling import fill_membrane
 from shadowtool.core.half_floats import not_finite, to_float, to_half
 from shadowtool.core.warp_map import positions, sample
 from shadowtool.errors import InputError, OptionError
+from shadowtool.io.files import real
 from shadowtool.io.image import (
     EXR,
     PNG,
@@ -98,7 +99,7 @@ def composite(
         {
             "--fg": Path(figure_frames.pattern).name,
             "--beta-frames": Path(beta_frames.pattern).name,
-            "--plates": plates.resolve().name,
+            "--plates": real(plates).name,
         }
         | ({} if warp is None else {"--warp": warp.name}),
     )

@@ -21,6 +21,8 @@ from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import open_footage
 
 FIRST_FRAME = 1001
+# How long a camera is recorded at most, seconds.
+_LONGEST = 86_400
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,8 @@ def open_source(
         OptionError: neither or both of a source and a camera are given.
     """
     if device is not None:
-        if source is not None or seconds is None or seconds <= 0:
-            raise OptionError("--device N takes --seconds T and no INPUT")
+        if source is not None or seconds is None or not 0 < seconds < _LONGEST:
+            raise OptionError("--device N takes --seconds T, up to a day, and no INPUT")
         return _camera(device, seconds, transfer, FIRST_FRAME if start is None else start)
     if seconds is not None:
         raise OptionError("--seconds T goes with --device N, not with an INPUT")

@@ -29,6 +29,7 @@ from shadowtool.core.noise import NoiseModel
 from shadowtool.core.plates import Plates
 from shadowtool.core.trimap import FIGURE
 from shadowtool.errors import OptionError
+from shadowtool.io.files import real
 from shadowtool.io.image import EXR, PNG, Header, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import read_plates
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
@@ -130,7 +131,7 @@ def matte(
             "noise": [[float(v) for v in row] for row in (noise.slope, noise.floor)],
         },
         {"frames": Path(footage.sequence.pattern).name}
-        | {"--plates": plates.resolve().name}
+        | {"--plates": real(plates).name}
         | {f"--{role}": Path(sequence.pattern).name for role, sequence in given.items()},
     )
     wanted = tuple(product for product in PRODUCTS if only in (None, product))

@@ -35,7 +35,7 @@ from shadowtool.core.robust_plates import (
     keyed,
 )
 from shadowtool.errors import DamagedFileError, InputError, OptionError
-from shadowtool.io.files import fingerprint_file, is_file, make_folder, new_folders
+from shadowtool.io.files import fingerprint_file, make_folder, new_folders
 from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, confidence_layers, plate_files
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
@@ -53,7 +53,9 @@ from shadowtool.steps.run import (
     Recipe,
     Result,
     Run,
+    decodes,
     refuse_existing,
+    refuse_inputs,
     refuse_other_step,
     unchanged,
     warn_of_nan,
@@ -118,6 +120,8 @@ def plate(
 
     written = [_place(output / HOLDOUT_FOLDER, frame) for frame in frames] if automatic else []
     refuse_existing([*plate_files(output), output / MANIFEST, *written], run)
+    read = [*footage.sequence.files.values(), *([] if plane is None else [Path(plane)])]
+    refuse_inputs([*plate_files(output), *written], read)
     refuse_other_step("plate", output, run)
     inputs = {"frames": Path(footage.sequence.pattern).name}
     shared = list[str]()
@@ -146,7 +150,7 @@ def plate(
         mark = recipe.fingerprint([*shared, *chain.from_iterable(known.values())])
         figures = unchanged(output, plate_files(output), mark)
         kept = written if figures and figures.get("held_out") == HOLDOUT_FOLDER else []
-        if figures is not None and all(is_file(file) for file in kept):
+        if figures is not None and all(ordered_map(decodes, kept, run.jobs)):
             used = [frame for frame in frames if known[frame]]
             skipped = [*absent, *(frame for frame in frames if not known[frame])]
             return Result("plate", output, used, len(used), skipped, figures)

@@ -12,7 +12,7 @@ from typing import Any
 from shadowtool import __version__
 from shadowtool.choices import Missing
 from shadowtool.errors import InputError, OptionError, OutputExistsError
-from shadowtool.io.files import fingerprinted, is_file, new_folders
+from shadowtool.io.files import fingerprinted, is_file, new_folders, real
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame, frame_number, frame_range
@@ -146,7 +146,7 @@ def name_of_frames(output: Path) -> str:
         OptionError: it has no name that a file could have.
     """
     # Frames whose names begin with a dot would be hidden.
-    name = output.resolve().name.lstrip(".")
+    name = real(output).name.lstrip(".")
     if not name.isprintable() or not name:
         raise OptionError(f"-o {str(output)!r}: frames are named after it; give a plain name")
     return name
@@ -210,7 +210,7 @@ class FrameWork:
     def _frame(self, frame: Frame, run: Run) -> tuple[Figures, bool] | None:
         try:
             sources = self.sources(frame)
-            _refuse_inputs(self.products(frame), sources)
+            refuse_inputs(self.products(frame), sources)
             with fingerprinted(sources) as inputs:
                 mark = self.recipe.fingerprint([*self.shared, *inputs])
                 if run.resume and (figures := current(self.products(frame), mark)) is not None:
@@ -281,13 +281,19 @@ def with_other_chunks(
     return {**kept, **rows}
 
 
-def _refuse_inputs(products: Iterable[Path], sources: Iterable[Path]) -> None:
-    """Stop before a step writes over what it reads."""
-    read = {file.name: file for file in sources}
+def refuse_inputs(products: Iterable[Path], sources: Iterable[Path]) -> None:
+    """Stop before a step writes over what it reads.
+
+    Raises:
+        OptionError: a product is a source.
+    """
+    read: dict[str, list[Path]] = {}
+    for source in sources:
+        read.setdefault(source.name, []).append(source)
     for file in products:
-        source = read.get(file.name)
-        if source is not None and is_file(file) and is_file(source) and file.samefile(source):
-            raise OptionError(f"{file}: is a frame to be read; give another -o")
+        for source in read.get(file.name, ()):
+            if is_file(file) and is_file(source) and file.samefile(source):
+                raise OptionError(f"{file}: is to be read, not written over; give another -o")
 
 
 def warn_of_nan(output: Path, counts: Mapping[str, int]) -> None:
@@ -318,6 +324,15 @@ def current(files: list[Path], mark: str) -> Figures | None:
         except (InputError, ValueError, TypeError, RecursionError):
             return None
     return figures
+
+
+def decodes(file: Path) -> bool:
+    """Whether a picture is there and whole."""
+    try:
+        read_image(file)
+    except InputError:
+        return False
+    return True
 
 
 def unchanged(output: Path, products: Iterable[Path], mark: str) -> Figures | None:

@@ -51,6 +51,7 @@ from shadowtool.steps.run import (
     Result,
     Run,
     refuse_existing,
+    refuse_inputs,
     refuse_other_step,
     unchanged,
     warn_of_nan,
@@ -111,6 +112,7 @@ def scan(
     region, plane_name, plane_mark = read_plane(plane, footage.header)
     products = [output / SCAN, output / LINES, output / PICTURE]
     refuse_existing([*products, output / MANIFEST], run)
+    refuse_inputs(products, [*footage.sequence.files.values(), Path(plane)])
     recipe = Recipe(
         "scan",
         {"gain": gain, "transfer": footage.transfer},

@@ -11,7 +11,7 @@ import numpy as np
 from shadowtool.core.bands import bands, in_all_channels
 from shadowtool.core.diffusion import diffuse
 from shadowtool.core.epipole import Epipole
-from shadowtool.core.half_floats import not_finite, to_float, to_half
+from shadowtool.core.half_floats import LARGEST_HALF, not_finite, to_float, to_half
 from shadowtool.core.inverse_map import compose, invert
 from shadowtool.core.pictures import warp_picture
 from shadowtool.core.warp_map import (
@@ -23,7 +23,7 @@ from shadowtool.core.warp_map import (
     sample,
 )
 from shadowtool.errors import OptionError, ReshootError
-from shadowtool.io.files import is_file, make_folder
+from shadowtool.io.files import is_file, make_folder, real
 from shadowtool.io.image import (
     EXR,
     PNG,
@@ -107,8 +107,8 @@ def warp(
         raise OptionError("a map takes two scans or more, swept at different angles")
     if source_scans and map_file is not None:
         raise OptionError("--source-scan goes with SCAN folders, not with --map")
-    if not math.isfinite(outside):
-        raise OptionError(f"--outside {outside}: must be a number")
+    if not abs(outside) <= LARGEST_HALF:
+        raise OptionError(f"--outside {outside}: must be a number that a half float can hold")
     if source_scans and len(source_scans) < 2:
         raise OptionError("give --source-scan twice or more, for sweeps at different angles")
     applied = None if apply_to is None else _open_frames(apply_to, output, run)
@@ -135,12 +135,12 @@ class _Scans:
 
     @property
     def names(self) -> list[str]:
-        return [folder.resolve().name for folder in self.folders]
+        return [real(folder).name for folder in self.folders]
 
     @property
     def labels(self) -> list[str]:
         """What tells the folders apart: their names, with those above them where they need it."""
-        paths = [folder.resolve() for folder in self.folders]
+        paths = [real(folder) for folder in self.folders]
         for depth in range(1, max(len(path.parts) for path in paths) + 1):
             labels = ["/".join(path.parts[-depth:]) for path in paths]
             if len(set(labels)) == len(set(paths)):

@@ -535,8 +535,115 @@ def test_a_step_does_not_write_over_what_it_reads(shot, command, copied, tree):
     for option in ("--resume", "--overwrite"):
         outcome = command(*words, option)
         assert outcome.code == 2
-        assert "source.1001.exr: is a frame to be read" in outcome.err
+        assert "source.1001.exr: is to be read" in outcome.err
         assert tree(frames) == before
+
+
+def test_nothing_given_is_written_over(shot, command, copied, tree):
+    figure, beta = (copied(f"matte/{part}") for part in ("fg", "beta"))
+    # Of the same names, as both come from elsewhere.
+    for folder in (figure, beta):
+        for file in sorted(folder.iterdir()):
+            file.rename(folder / f"x.{file.name.split('.')[1]}.exr")
+    plain = [figure.rename(figure.parent / "x"), beta]
+    lit = copied("source")
+    for number in range(1001, 1007):
+        frame(lit, number).rename(lit / f"{'lit' if number == 1001 else f'lit.{number}'}.exr")
+    (lit / "scan.png").write_bytes((shot.folder / "mask.png").read_bytes())
+    words = ["--fg", plain[0], "--beta-frames", plain[1], "--plates", shot.plates]
+    for folder, arguments in (
+        (plain[0], ["composite", *words]),
+        (lit, ["plate", lit / "lit.exr"]),
+        (lit, ["scan", shot.sweep1, "--plane", lit / "scan.png"]),
+    ):
+        before = tree(folder)
+        outcome = command(*arguments, "-o", folder, "--overwrite", "-q")
+        assert outcome.code == 2, outcome.err
+        assert "not written over; give another -o" in outcome.err
+        assert tree(folder) == before
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_an_output_folder_that_is_a_link_to_itself(name, shot, command, tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    for output in (tmp_path / "loop", tmp_path / "loop" / "x"):
+        outcome = command(*shot.arguments(name), "-o", output, "-q")
+        assert outcome.code == 1
+        assert outcome.err.count("\n") == 1
+        assert "fault of shadowtool's own" not in outcome.err
+
+
+@pytest.mark.parametrize("name", ["capture", "matte", "composite"])
+def test_frame_numbers_of_too_many_digits(name, shot, refused, tmp_path):
+    assert "not a frame range" in refused(shot.arguments(name), "--frames", "9" * 29, code=2)
+    write_exr(tmp_path / f"a.{'9' * 40}.exr", {"RGB": picture()}, Header(WIDTH, HEIGHT))
+    refused(["capture", tmp_path])
+
+
+@pytest.mark.parametrize("name", ["plate", "scan", "warp", "matte", "capture"])
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999"])
+def test_a_record_with_what_is_no_number_is_none(name, number, shot, command, tmp_path):
+    output = tmp_path / "out"
+    words = [*shot.arguments(name), "-o", output, "-q"]
+    assert command(*words).code == 0
+    record = output / "shadowtool.json"
+    written = record.read_text()
+    damaged = re.sub(r": \d[\d.]*(,?)\n", rf": {number}\1\n", written)
+    record.write_text(damaged)
+    chunk = ["--overwrite", "--frames", "1001-1002"] if name in ("matte", "capture") else []
+    assert command(*words, *(chunk or ["--resume"])).code == 0
+    assert json.loads(record.read_text())["step"] == name
+
+
+def test_a_channel_that_is_called_like_three(shot, command, copied, tmp_path):
+    alpha = copied("matte/fg")
+    for file in alpha.iterdir():
+        values = read_image(file).channel("A").astype(np.float16)
+        write_exr(file, {"RGB": values, "x": values}, Header(WIDTH, HEIGHT))
+    words = [*shot.arguments("matte"), "--alpha", alpha, "-q"]
+    assert command(*words, "-o", tmp_path / "out").code == 0
+
+
+@pytest.mark.parametrize("outside", ["1e39", "nan", "-70000"])
+def test_a_value_outside_that_no_half_can_hold(outside, shot, refused):
+    assert "--outside" in refused([*shot.arguments("apply"), "--outside", outside], code=2)
+
+
+@pytest.mark.parametrize("scale", [2.0, 1.5, 0.5])
+def test_a_pixel_that_is_no_number_spreads_to_none_when_resized(
+    scale, shot, command, copied, tmp_path
+):
+    source = copied("source")
+    values = read_image(frame(source)).rgb("linear").copy()
+    clean = tmp_path / "clean"
+    assert command("capture", source, "-o", clean, "--scale", scale, "-q").code == 0
+    values[10, 20], values[20, 30] = np.nan, np.inf
+    write_exr(frame(source), {"RGB": values}, Header(WIDTH, HEIGHT))
+    output = tmp_path / "out"
+    assert command("capture", source, "-o", output, "--scale", scale, "-q").code == 0
+    made, expected = (read_image(frame(folder)).rgb("linear") for folder in (output, clean))
+    bad = ~np.isfinite(made).all(axis=-1)
+    assert 2 <= bad.sum() <= 2 * np.ceil(scale) ** 2
+    assert np.abs(made - expected)[~bad].max() < 0.5
+
+
+def test_holdouts_that_are_damaged_are_made_again(shot, command, tmp_path, tree):
+    output = tmp_path / "out"
+    words = ["plate", shot.source, "-o", output, "-q"]
+    assert command(*words).code == 0
+    before = tree(output)
+    damaged = sorted((output / "holdout").iterdir())[2]
+    damaged.write_bytes(damaged.read_bytes()[:40])
+    assert command(*words, "--resume").code == 0
+    assert tree(output) == before
+
+
+@pytest.mark.parametrize(
+    "words", [["--device", "99999999999"], ["--device", "1", "--seconds", "nan"]]
+)
+def test_a_camera_that_none_can_be(words, command, tmp_path):
+    outcome = command("capture", "--seconds", "1", *words, "-o", tmp_path / "out")
+    assert outcome.code == 2
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,7 @@ def _crop(ctx: click.Context, parameter: click.Parameter, value: str | None) -> 
 @transfer_option
 @click.option(
     "--start",
-    type=click.IntRange(-(10**9), 10**9),
-    metavar="INTEGER",
+    type=int,
     help="Number of the first frame. Default: 1001 for a movie or camera, a sequence keeps its"
     " own. --frames goes by it in a movie, and by a sequence's own numbers.",
 )

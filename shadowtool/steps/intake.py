@@ -23,6 +23,7 @@ from shadowtool.steps.footage import open_footage
 FIRST_FRAME = 1001
 # How long a camera is recorded at most, seconds.
 _LONGEST = 86_400
+_LAST_FRAME = 10**9
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,8 @@ def open_source(
         InputError: there is nothing usable.
         OptionError: neither or both of a source and a camera are given.
     """
+    if start is not None and abs(start) > _LAST_FRAME:
+        raise OptionError(f"--start {start}: no frame has such a number")
     if device is not None:
         if source is not None or seconds is None or not 0 < seconds < _LONGEST:
             raise OptionError("--device N takes --seconds T, up to a day, and no INPUT")

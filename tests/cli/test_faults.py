@@ -639,7 +639,12 @@ def test_holdouts_that_are_damaged_are_made_again(shot, command, tmp_path, tree)
 
 
 @pytest.mark.parametrize(
-    "words", [["--device", "99999999999"], ["--device", "1", "--seconds", "nan"]]
+    "words",
+    [
+        ["--device", "99999999999"],
+        ["--device", "1", "--seconds", "nan"],
+        ["--device", "1", "--start", "9" * 30],
+    ],
 )
 def test_a_camera_that_none_can_be(words, command, tmp_path):
     outcome = command("capture", "--seconds", "1", *words, "-o", tmp_path / "out")

@@ -58,10 +58,10 @@ def shadow_ratio_field(
     return _ratio_field(lit, shadow, gray, _level(gray, frames), plane)
 
 
-def _level(gray: Float32, frames: NDArray[np.uint32]) -> Bool:
-    """Where a shadow fell in several frames and log(S/L) is level: what climbs is a penumbra,
+def _level(gray: Float32, frames: NDArray[np.uint32], least: int = _FIRM) -> Bool:
+    """Where a shadow fell in so many frames and log(S/L) is level: what climbs is a penumbra,
     however long it stood there."""
-    return (frames >= _FIRM) & np.isfinite(gray) & (_slope(gray) < _SLOPE)
+    return (frames >= least) & np.isfinite(gray) & (_slope(gray) < _SLOPE)
 
 
 def _ratio_field(
@@ -133,11 +133,14 @@ def complete_shadow(
     else:
         partial, region = True, plane
     gray = _log_ratio(channel_sum(lit), channel_sum(shadow))
-    level = _level(gray, frames)
-    found = _ratio_field(lit, shadow, gray, level, plane)
+    # In a take of few frames no shadow stays for several.
+    for least in (_FIRM, 1):
+        level = _level(gray, frames, least)
+        if (found := _ratio_field(lit, shadow, gray, level, plane)) is not None:
+            break
     result = np.asarray(cv2.copyTo(shadow, dark.view(np.uint8), lit.copy()), np.float32)
     if found is None:
-        return Completed(result, np.asarray(dark, np.float32), partial=False)
+        return Completed(result, np.asarray(dark, np.float32), plane is not None)
     expected, spread = found
     gray -= np.log(channel_sum(expected) / 3)
     with np.errstate(invalid="ignore"):

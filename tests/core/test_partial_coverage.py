@@ -95,6 +95,20 @@ def test_few_dark_frames_give_way_to_the_planes_ratio() -> None:
     assert take.error(found.shadow)[spot].max() < take.error(take.measured)[spot].min() / 2
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_in_a_take_of_few_frames_the_few_tell(frames: int) -> None:
+    take = crossed(RATIO, band(), frames=frames)
+    for plane in (None, ROWS >= 0):
+        completed = take.completed(plane)
+        assert completed.partial
+        assert np.percentile(take.error(completed.shadow), 95) < 0.1
+
+
+def test_a_region_makes_a_plane_of_what_it_marks_whatever_is_known() -> None:
+    take = crossed(RATIO, np.ones((HEIGHT, WIDTH)))
+    assert take.completed(ROWS > 30).partial
+
+
 def test_a_slowly_varying_ratio_is_followed() -> None:
     slope = np.exp(0.35 * (COLUMNS / WIDTH - 0.5))[..., None]
     take = crossed(RATIO * slope, band())

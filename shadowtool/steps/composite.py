@@ -154,7 +154,10 @@ def composite(
         names = ("unknown", "not_finite")
         return {name: sum(int(row.get(name, 0)) for row in rows) for name in names}
 
-    work = FrameWork(recipe, output, products, sources, shared, make)
+    def others(frame: Frame) -> list[Path]:
+        return [] if ratio else [output / RATIO_FOLDER / frame_file(RATIO_FOLDER, frame, EXR)]
+
+    work = FrameWork(recipe, output, products, sources, shared, make, others)
     return work.run(frames, run, absent, summary)
 
 

@@ -152,7 +152,7 @@ def matte(
     shared = [stored.fingerprint, *given]
     # Plates in which something is unknown are not kept beside those that it was taken out of.
     del stored
-    work = FrameWork(recipe, output, take.products, take.sources, shared, take.make)
+    work = FrameWork(recipe, output, take.products, take.sources, shared, take.make, take.others)
     result = work.run(frames, run, absent, take.summary)
     if result.figures.get("hidden", 0) > _TOO_MUCH:
         logger.warning(
@@ -280,6 +280,9 @@ class _Take:
 
     def products(self, frame: Frame) -> list[Path]:
         return [self._file(product, frame) for product in self.wanted]
+
+    def others(self, frame: Frame) -> list[Path]:
+        return [] if self.alpha is None else [self._file("trimap", frame)]
 
     def sources(self, frame: Frame) -> list[Path]:
         files = [self.footage.sequence.path(frame)]

@@ -35,7 +35,7 @@ from shadowtool.core.robust_plates import (
     keyed,
 )
 from shadowtool.errors import DamagedFileError, InputError, OptionError
-from shadowtool.io.files import fingerprint_file, make_folder, new_folders
+from shadowtool.io.files import fingerprint_file, make_folder, new_folders, real
 from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, confidence_layers, plate_files
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
@@ -58,6 +58,7 @@ from shadowtool.steps.run import (
     refuse_inputs,
     refuse_other_step,
     unchanged,
+    warn_of_left,
     warn_of_nan,
     write_manifest,
 )
@@ -213,6 +214,7 @@ def plate(
             footage.sequence.pattern,
             100 * (1 - figures["shaded"]),
         )
+    warn_of_left(_other_holdouts(output / HOLDOUT_FOLDER, take, held))
     write_manifest(output, recipe, mark, figures)
     return Result("plate", output, take.used, 0, [*absent, *take.skipped], figures)
 
@@ -513,6 +515,14 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         return plates, figures
 
     return _Estimate(lit, noise, complete)
+
+
+def _other_holdouts(folder: Path, take: "_Take", given: Sequence | None) -> list[Path]:
+    """Holdouts that are neither of this run nor what it was given."""
+    if given is not None and real(Path(given.pattern).parent) == real(folder):
+        return []
+    written = [] if take.background is None else [_place(folder, frame) for frame in take.used]
+    return sorted(set(folder.glob(f"*{PNG}")) - set(written))
 
 
 def _place(folder: Path, frame: Frame) -> Path:

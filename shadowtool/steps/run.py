@@ -163,6 +163,7 @@ class FrameWork:
         sources: the files that a frame is made of.
         shared: fingerprints of what all frames depend on.
         make: writes the products with the given provenance, returns the frame's figures.
+        others: files that a frame becomes under other options only.
     """
 
     recipe: Recipe
@@ -171,6 +172,7 @@ class FrameWork:
     sources: Callable[[Frame], list[Path]]
     shared: list[str]
     make: Callable[[Frame, dict[str, str]], Figures]
+    others: Callable[[Frame], list[Path]] = lambda frame: []
 
     def run(
         self,
@@ -203,6 +205,7 @@ class FrameWork:
             if not rows:
                 raise InputError(f"{self.output}: no frame could be made; all are skipped")
         warn_of_nan(self.output, {frame: row.get("not_finite", 0) for frame, row in rows.items()})
+        warn_of_left(file for frame in frames for file in self.others(frame))
         figures = self._record(rows, summary)
         done = [frame for frame in frames if str(frame) in rows]
         return Result(self.recipe.step, self.output, done, kept, skipped, figures)
@@ -294,6 +297,17 @@ def refuse_inputs(products: Iterable[Path], sources: Iterable[Path]) -> None:
         for source in read.get(file.name, ()):
             if is_file(file) and is_file(source) and file.samefile(source):
                 raise OptionError(f"{file}: is to be read, not written over; give another -o")
+
+
+def warn_of_left(files: Iterable[Path]) -> None:
+    """Name files that an earlier run wrote and this one did not, if they are there."""
+    if left := [file for file in files if is_file(file)]:
+        more = f" and {len(left) - 1} more" if len(left) > 1 else ""
+        logger.warning(
+            "%s%s: left from an earlier run, of other settings or input; remove what is not meant",
+            left[0],
+            more,
+        )
 
 
 def warn_of_nan(output: Path, counts: Mapping[str, int]) -> None:

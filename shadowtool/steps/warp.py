@@ -47,6 +47,7 @@ from shadowtool.steps.run import (
     refuse_existing,
     refuse_other_step,
     unchanged,
+    warn_of_left,
     with_figures,
     write_manifest,
 )
@@ -118,6 +119,11 @@ def warp(
         record_in = applied.folder if is_file(output / WARP) else output
         return [_apply(map_file, applied, record_in, run, outside)]
     results = [_solve(scans, source_scans or [], output, run, iterations)]
+    if not results[0].kept:
+        # What the map that was there before was applied to.
+        folders = {record.parent for record in output.glob(f"*/{MANIFEST}")}
+        for folder in sorted(folders - ({applied.folder} if applied else set())):
+            warn_of_left(sorted(folder.glob(f"*{EXR}")))
     if applied is not None:
         folder = output / applied.sequence.name
         results.append(_apply(output / WARP, applied, folder, run, outside))

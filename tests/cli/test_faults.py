@@ -627,6 +627,37 @@ def test_a_pixel_that_is_no_number_spreads_to_none_when_resized(
     assert np.abs(made - expected)[~bad].max() < 0.5
 
 
+@pytest.mark.parametrize(
+    ("name", "before", "after", "left"),
+    [
+        ("composite", [], None, "ratio/ratio.1001.exr and 5 more"),
+        ("matte", [], ["--alpha", "matte/fg"], "trimap/trimap.1001.png and 5 more"),
+        ("source plate", [], ["--holdout", "none"], "holdout/holdout.1001.png and 5 more"),
+        ("source plate", [], ["--frames", "1003-1006"], "holdout/holdout.1001.png and 1 more"),
+        ("warp", ["--apply", "matte/beta"], [], "beta/beta.1001.exr and 5 more"),
+    ],
+)
+def test_what_a_run_leaves_of_another_is_named(name, before, after, left, shot, command, tmp_path):
+    output = tmp_path / "out"
+    words = shot.arguments(name.split()[-1])
+    if name == "source plate":
+        words = replaced(words, 1, shot.source)
+
+    def given(options: list[str]) -> list[str]:
+        return [str(shot.folder / word) if "/" in word else word for word in options]
+
+    assert command(*words, *given(before), "-o", output, "-q").code == 0
+    # The same again leaves nothing.
+    same = command(*words, *given(before), "-o", output, "--overwrite")
+    assert same.code == 0
+    assert "left from" not in same.err
+    if after is None:
+        words, after = [word for word in words if word != "--ratio"], []
+    outcome = command(*words, *given(after), "-o", output, "--overwrite")
+    assert outcome.code == 0
+    assert f"{left}: left from an earlier run" in outcome.err
+
+
 def test_holdouts_that_are_damaged_are_made_again(shot, command, tmp_path, tree):
     output = tmp_path / "out"
     words = ["plate", shot.source, "-o", output, "-q"]

@@ -48,7 +48,7 @@ def _headline(row: dict[str, Any]) -> str:
 
 def _text(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in value.items())
+        return ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in value.items()) or "none"
     if isinstance(value, list):
         return ", ".join(map(_text, value)) or "none"
     return "unknown" if value is None else str(value)

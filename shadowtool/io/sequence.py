@@ -133,7 +133,7 @@ def open_sequence(source: str | Path, role: str = "frames") -> Sequence:
     """
     text = os.fspath(source)
     if not text:
-        raise InputError(f"no file or folder is named for the {role}")
+        raise InputError(f"no file or folder is named{_for(role) or ' for the frames'}")
     path = Path(text)
     try:
         if path.is_dir():
@@ -143,7 +143,7 @@ def open_sequence(source: str | Path, role: str = "frames") -> Sequence:
     except OSError as error:
         raise InputError(f"{_short(text)}: cannot look there: {error.strerror}") from None
     if not _TOKENS.search(path.name):
-        raise InputError(f"{_short(text)}: no such file or folder for the {role}")
+        raise InputError(f"{_short(text)}: no such file or folder{_for(role)}")
     return _of_pattern(path, role)
 
 
@@ -192,7 +192,10 @@ def frame_file(name: str, frame: Frame, suffix: str) -> str:
 def _in_folder(folder: Path, role: str) -> Sequence:
     found = _sequences(folder)
     if not found:
-        raise InputError(f"{folder}: holds no EXR or PNG frames for the {role}")
+        raise InputError(
+            f"{folder}: holds no EXR or PNG frames{_for(role)}; run capture on a movie, and convert"
+            " other pictures first"
+        )
     # One sequence and a still beside it (a reference, a slate) is one sequence.
     chosen = [sequence for sequence in found if sequence.digits] or found
     if len(chosen) > 1:
@@ -277,7 +280,7 @@ def _of_pattern(path: Path, role: str) -> Sequence:
     except (FileSeqException, ValueError, ArithmeticError, OSError):
         found = []
     if not found:
-        raise InputError(f"{_short(os.fspath(path))}: no frames for the {role} are there")
+        raise InputError(f"{_short(os.fspath(path))}: no such frames are there{_for(role)}")
     if len(found) > 1:
         # The number of digits tells sequences apart only where there are several.
         found = [item for item in found if item.digits == max(wanted.zfill(), 1)]
@@ -306,6 +309,10 @@ def _unreadable(path: Path) -> InputError:
         f"{_short(os.fspath(path))}: neither EXR nor PNG; run capture on a movie, and convert other"
         " pictures first"
     )
+
+
+def _for(role: str) -> str:
+    return "" if role == "frames" else f" for the {role}"
 
 
 def _short(text: str) -> str:

@@ -323,7 +323,9 @@ class _Take:
         return figures
 
     def summary(self, rows: list[Figures]) -> Figures:
-        """Parts of all the frames' pixels, and the range of gains."""
+        """Parts of all the frames' pixels, and the range of gains; none of trimaps alone."""
+        if self.wanted == ("trimap",):
+            return {}
         names = ("unknown", "hidden", "not_finite")
         header = self.footage.header
         pixels = max(len(rows), 1) * header.width * header.height

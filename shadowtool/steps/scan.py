@@ -383,7 +383,7 @@ def _advise(figures: Figures, take: str) -> None:
     if figures["off_lines"] > _MANY_OFF:
         logger.warning(
             "%s: %.0f%% of the plane lies off the edge's lines; a board that is bent, a stick that"
-            " is too narrow, or something else that crosses does that",
+            " is too narrow, a camera that trembles, or something else that crosses does that",
             take,
             100 * figures["off_lines"],
         )

@@ -184,6 +184,7 @@ def without_slips(found: WarpMap) -> WarpMap:
     own, others = displacement[tuple(places.T)][:, np.newaxis], displacement[around]
     middle = np.median(others, axis=1)
     agreed = np.linalg.norm(others - middle[:, np.newaxis], axis=-1) <= _SLIPPED / 2
+    agreed &= np.isfinite(found.error)[around]
     friends = np.linalg.norm(others - own, axis=-1) <= _SLIPPED
     slipped = (agreed.sum(axis=1) >= _AGREED) & (friends.sum(axis=1) <= _FRIENDS)
     warp, error, at = found.warp.copy(), found.error.copy(), tuple(places[slipped].T)

@@ -193,6 +193,10 @@ def test_what_is_unknown_is_left_and_is_no_neighbour() -> None:
     found.warp[24, 4:6], found.error[24, 4:6] = np.nan, np.inf
     found.warp[26, 5], found.error[26, 5] = np.nan, np.inf
     assert same_maps(without_slips(found), found)
+    lone = bent()
+    lone.warp[22:27, 3:9], lone.error[22:27, 3:9] = np.nan, np.inf
+    lone.warp[24, 5], lone.error[24, 5] = (5, 24), 0.1
+    assert same_maps(without_slips(lone), lone)
     nothing = WarpMap(np.full((9, 9, 2), np.nan, np.float32), np.full((9, 9), np.inf, np.float32))
     assert same_maps(without_slips(nothing), nothing)
     for shape in ((1, 1), (1, 9), (2, 2)):

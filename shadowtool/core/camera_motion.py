@@ -4,7 +4,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import to_float
+
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 # Larger frames are measured at this width; the result is in pixels of the full frame.
 _WIDTH = 640
@@ -12,6 +15,9 @@ _TILES = 4, 3
 _LEAST_TILE = 24
 # A tile whose best correlation is below this shows something else than before.
 _LEAST_CORRELATION = 0.5
+# How many pairs of rows, and of places in them, tell how a camera trembles; how often what doesn't
+# fit is weighed anew, and from how many deviations on it doesn't count.
+_STRIPS, _PLACES, _WEIGHED, _OUT = 32, 256, 5, 4.7
 # The standard error of a median, times the square root of their number, in median deviations.
 _MEDIAN_ERROR = 1.48 * 1.25
 
@@ -59,6 +65,58 @@ def shift(reference: Float32, other: Float32, width: int) -> float | None:
     error = _MEDIAN_ERROR * np.median(np.abs(shifts - middle), axis=0) / np.sqrt(len(shifts))
     x, y = np.maximum(np.abs(middle) - 3 * error, 0)
     return float(np.hypot(x, y) * width / reference.shape[1])
+
+
+def strips(gray: NDArray[np.floating]) -> Float32:
+    """What `tremble` looks at of a frame's luminance (H, W): evenly spaced pairs of neighbouring
+    rows, (K, 2, W)."""
+    rows = np.unique(np.linspace(0, max(len(gray) - 2, 0), _STRIPS).astype(int))
+    pairs = np.stack([rows, np.minimum(rows + 1, len(gray) - 1)], axis=1)
+    return to_float(np.ascontiguousarray(gray[pairs]))
+
+
+def tremble(frames: list[Float32]) -> float:
+    """By how much a camera's place varies over a take, the standard deviation along each axis.
+
+    As far as frames differ from the first by I(x + s) - I(x) ≈ s·∇I and by their exposure, s
+    follows by least squares (Lucas and Kanade 1981); what something moved in front of fits badly
+    and is left out.
+
+    Args:
+        frames: from `strips`, spread over the take.
+
+    Returns:
+        Pixels; what is within the error of its measurement counts as nothing.
+    """
+    if len(frames) < 2 or frames[0].shape[2] < 3:
+        return 0.0
+    first, places, errors = frames[0], [np.zeros(2)], [0.0]
+    here = np.arange(1, first.shape[2] - 1, -(-first.shape[2] // _PLACES))
+    for other in frames[1:]:
+        middle = (first + other) / 2
+        across = (middle[..., here + 1] - middle[..., here - 1]).mean(axis=1) / 2
+        down = (middle[:, 1] - middle[:, 0])[:, here]
+        light, change = (part[..., here].mean(axis=1) for part in (middle, other - first))
+        table = np.stack([across, down, light, change], axis=-1).reshape(-1, 4).astype(np.float64)
+        table = table[np.isfinite(table).all(axis=1)]
+        place, error = _moved(table[:, :3], table[:, 3])
+        places.append(place)
+        errors.append(error)
+    variance = np.var(places, axis=0).mean() - np.mean(errors)
+    return float(np.sqrt(max(variance, 0)))
+
+
+def _moved(terms: Float64, change: Float64) -> tuple[Float64, float]:
+    """The displacement (2,) that explains the change best, and its variance along an axis."""
+    solved: Float64 = np.zeros(3)
+    normal, spread = np.eye(3), 0.0
+    for _ in range(_WEIGHED if change.size else 0):
+        rest = change - terms @ solved
+        spread = float(np.median(np.abs(rest))) / 0.6745 + 1e-9
+        weight = np.clip(1 - (rest / (_OUT * spread)) ** 2, 0, 1) ** 2
+        normal = terms.T @ (terms * weight[:, np.newaxis]) + 1e-9 * np.eye(3)
+        solved = np.asarray(np.linalg.solve(normal, terms.T @ (weight * change)), np.float64)
+    return solved[:2], float(np.linalg.inv(normal)[:2, :2].trace() / 2 * spread**2)
 
 
 def _tiles(image: Float32) -> list[Float32]:

@@ -134,7 +134,9 @@ def _passed(crossings: Crossings, threshold: NDArray[np.floating]) -> Float32:
     return np.asarray(crossings.at - 1 + np.clip(part, 0, 1), np.float32)
 
 
-def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32, Float32]:
+def own_times(
+    crossings: Crossings, noise: NoiseModel, trembling: float = 0.0
+) -> tuple[Float32, Float32, Float32]:
     """The time that each pixel tells alone, and how well it can.
 
     An edge that takes the part τ < 1 of a frame to pass is seen on its way by as many pixels. Of
@@ -144,6 +146,10 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
     interpolation between them is right; how long they take, and so how far noise moves the time,
     is told by how little of the light is lost from one of the two frames to the other.
 
+    Args:
+        trembling: by how much the camera's place varies, standard deviation in pixels. On texture
+            that is so much more noise.
+
     Returns:
         Positions among the frames and their standard deviations, in frames, NaN and infinite where
         unknown, and how many frames the edge takes to pass; (H, W) float32 each.
@@ -152,11 +158,13 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
     lost, left, passing, fall = (np.empty(known.shape, np.float32) for _ in range(4))
     counts = np.zeros((2, _BINS))
     cuts = list(bands(known.shape, _ARRAYS))
+    ends = (crossings.highest, crossings.lowest) if trembling else ()
+    rough = [np.float32(trembling) * _slope(end) for end in ends]
     for rows in cuts:
         part = crossings.part(rows)
-        lit, dark, contrast, *sigmas = _extremes(part, noise)
-        ends = (lost, lit - part.before), (left, part.after - dark)
-        for (values, of), count, sigma in zip(ends, counts, sigmas, strict=True):
+        lit, dark, contrast, *sigmas = _extremes(part, noise, [texture[rows] for texture in rough])
+        passed = (lost, lit - part.before), (left, part.after - dark)
+        for (values, of), count, sigma in zip(passed, counts, sigmas, strict=True):
             seen = np.minimum(np.fmax(of / contrast, 0), 1)
             count += _counts(seen, known[rows])
             # Not caught is as good as not on its way.
@@ -179,18 +187,33 @@ def own_times(crossings: Crossings, noise: NoiseModel) -> tuple[Float32, Float32
     time, error = np.empty_like(lost), np.empty_like(lost)
     for rows in cuts:
         caught = lost[rows], left[rows]
-        told = _told(crossings.part(rows), noise, caught, duration[rows])
+        extremes = _extremes(crossings.part(rows), noise, [texture[rows] for texture in rough])
+        told = _told(crossings.part(rows), extremes, caught, duration[rows])
         time[rows] = np.where(known[rows], told[0], np.float32(np.nan))
         error[rows] = np.where(known[rows], told[1], np.float32(np.inf))
     return time, error, duration
 
 
+def _slope(gray: Float32) -> Float32:
+    """Length of the gradient of a picture (H, W), per pixel; unknown is 0."""
+    gray = np.nan_to_num(gray)
+    # Differences of neighbours on either side, with nothing of the rows and columns beside them.
+    x, y = (cv2.Sobel(gray, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5) for dx in (1, 0))
+    return np.asarray(cv2.magnitude(x, y), np.float32)
+
+
 def _extremes(
-    crossings: Crossings, noise: NoiseModel
+    crossings: Crossings, noise: NoiseModel, rough: list[Float32]
 ) -> tuple[Float32, Float32, Float32, Float32, Float32]:
-    """Luminance lit and dark, their difference, and the standard deviations of both in its unit."""
+    """Luminance lit and dark, their difference, and the standard deviations of both in its unit.
+
+    Args:
+        rough: standard deviations of both besides the noise; nothing if there are none.
+    """
     lit_sigma = _sigma(crossings.highest, noise)
     dark_sigma = _sigma(crossings.lowest, noise)
+    for sigma, more in zip((lit_sigma, dark_sigma), rough, strict=False):
+        np.hypot(sigma, more, out=sigma)
     # The extremes of noise lie beyond what was lit and dark.
     beyond = np.float32(_largest(crossings.frames / 2))
     lit = crossings.highest - beyond * lit_sigma
@@ -201,19 +224,20 @@ def _extremes(
 
 def _told(
     crossings: Crossings,
-    noise: NoiseModel,
+    extremes: tuple[Float32, Float32, Float32, Float32, Float32],
     caught: tuple[Float32, Float32],
     duration: Float32,
 ) -> tuple[Float32, Float32]:
     """Times and errors of known pixels.
 
     Args:
+        extremes: from `_extremes`.
         caught: what part of the light was lost in the frame before, and what was left in the one
             after the crossing; 0 where the edge was not caught on its way.
         duration: frames that the edge takes to pass, around each pixel.
     """
     lost, left = caught
-    lit, dark, _, lit_sigma, dark_sigma = _extremes(crossings, noise)
+    lit, dark, _, lit_sigma, dark_sigma = extremes
     sharp = np.minimum(duration, 1)
     half, one = np.float32(0.5), np.float32(1)
     # Midway between the frames, unless one of them caught it.

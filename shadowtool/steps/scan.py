@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Gain
 from shadowtool.core.bands import overlapping_bands
+from shadowtool.core.camera_motion import strips, tremble
 from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
 from shadowtool.core.exposure import RunningGain, sampled_areas, without_gain
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
@@ -77,6 +78,8 @@ _TREMBLING, _NO_SWEEP, _ON_LINES = 2.0, 4.0, 0.5
 # Pixels of the plane are off the lines of their times by more than this, pixels; and so many are
 # only if something is wrong.
 _OFF, _MANY_OFF = 2.0, 0.06
+# The camera's place varies by more than this, pixels, only if it isn't held firmly.
+_UNSTEADY = 0.05
 # Between frames so many times further apart than usual the shadow passes more than can be told.
 _HOLE = 3.0
 # If more of the frame than this can't be told from one reading, the frames are read again.
@@ -126,7 +129,7 @@ def scan(
         figures = unchanged(output, products, mark)
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
-    crossings, noise, marks, gains, bad, first = _crossings(footage, frames, gain, run)
+    crossings, noise, trembling, marks, gains, bad, first = _crossings(footage, frames, gain, run)
     warn_of_nan(output, bad)
     used = list(gains)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
@@ -136,7 +139,7 @@ def scan(
             "%s: frame numbers this large leave float32 times few digits; renumber the take",
             footage.sequence.pattern,
         )
-    times, raised = _times(crossings, noise, region, numbers, run.jobs)
+    times, raised = _times(crossings, noise, trembling, region, numbers, run.jobs)
     # The encoder wants the room.
     del crossings
     for before in np.flatnonzero(_holes(numbers)):
@@ -162,6 +165,7 @@ def scan(
             off = off_lines(times.time, region, lines) > _OFF
             figures = _figures(times, lines, gains, bend) | {
                 "errors_raised": round(raised, 2),
+                "trembling": round(trembling, 3),
                 "off_lines": round(float(off.mean()), 4) if off.size else 0.0,
             }
             _advise(figures, footage.sequence.pattern)
@@ -184,6 +188,7 @@ class _Reading(NamedTuple):
     """What one reading of the pass gives.
 
     Attributes:
+        trembling: by how much the camera's place varies, pixels.
         marks: the content of its files.
         gains: of the frames that could be read.
         not_finite: how many pixels of frames are NaN or infinite.
@@ -192,6 +197,7 @@ class _Reading(NamedTuple):
 
     crossings: Crossings
     noise: NoiseModel
+    trembling: float
     marks: list[str]
     gains: dict[Frame, float]
     not_finite: dict[str, int]
@@ -204,6 +210,7 @@ class _Seen(NamedTuple):
     gray: Float16
     areas: Float32
     sample: Float32 | None
+    strips: Float32 | None
     picture: UInt8 | None
     mark: str
 
@@ -219,22 +226,24 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
                 return None
             raise
         colours = image.colours(footage.transfer)
-        sample = picture = None
-        if position in samples.values():
-            sample = np.stack([thin(plane) for plane in colours], axis=-1)
+        sample = rows = picture = None
         if position == 0:
             picture = np.stack([display(plane) for plane in colours], axis=-1)
         gray = luminance_halfs(*colours)
-        return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
+        if position in samples.values():
+            sample = np.stack([thin(plane) for plane in colours], axis=-1)
+            rows = strips(gray)
+        return _Seen(gray, sampled_areas(gray), sample, rows, picture, image.fingerprint)
 
     finder, exposure = CrossingFinder(), RunningGain()
     marks, gains, bad = list[str](), dict[Frame, float](), dict[str, int]()
     thinned: dict[int, Float32] = {}
+    seen_rows: list[Float32] = []
     first: UInt8 | None = None
     run.progress(0, len(frames))
     for position, item in enumerate(ordered_map(read, range(len(frames)), run.jobs)):
         if item is not None:
-            gray, areas, sample, picture, mark = item
+            gray, areas, sample, rows, picture, mark = item
             first = first if picture is None else picture
             own = exposure.add(areas) if gain == "auto" else 1.0
             bad[str(frames[position])] = finder.add(without_gain(gray, own))
@@ -242,17 +251,22 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
             gains[frames[position]] = own
             if sample is not None:
                 level = without_gain(sample, own)
+                seen_rows += [] if rows is None else [rows]
                 thinned |= {n: level for n, where in samples.items() if where == position}
         run.progress(position + 1, len(frames))
     if len(gains) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
-    with meanwhile(lambda: noise_model(noise_levels(thinned))) as measured:
+
+    def measure() -> tuple[NoiseModel, float]:
+        return noise_model(noise_levels(thinned)), tremble(seen_rows)
+
+    with meanwhile(measure) as measured:
         found = finder.found()
-    noise = measured()
+    noise, trembling = measured()
     crossings = significant(found, noise)
     if crossings.lost.mean() > _LOST:
         crossings = _looked_at_again(footage, crossings, gains, run)
-    return _Reading(crossings, noise, marks, gains, bad, first)
+    return _Reading(crossings, noise, trembling, marks, gains, bad, first)
 
 
 def _looked_at_again(
@@ -275,13 +289,14 @@ def _looked_at_again(
 def _times(
     crossings: Crossings,
     noise: NoiseModel,
+    trembling: float,
     region: NDArray[np.bool_],
     numbers: NDArray[np.float64],
     jobs: int | None,
 ) -> tuple[ShadowTimes, float]:
     """Times and errors, each pixel's own and as its neighbours tell them too; and by what factor
     errors are larger than noise makes them."""
-    own, own_error, duration = own_times(crossings, noise)
+    own, own_error, duration = own_times(crossings, noise, trembling)
     contrast = np.nan_to_num(crossings.highest - crossings.lowest)
     loss = usual_loss(contrast, crossings.highest, crossings.at > 0, region)
     in_shade = loss < SHADE
@@ -379,6 +394,13 @@ def _advise(figures: Figures, take: str) -> None:
             " trembles or a codec does that, fix it or stabilize the take",
             take,
             figures["errors_raised"],
+        )
+    if figures["trembling"] > _UNSTEADY:
+        logger.warning(
+            "%s: the camera trembles by %.2f pixels, and objects are less well known; hold it"
+            " firmly, or stabilize the take",
+            take,
+            figures["trembling"],
         )
     if figures["off_lines"] > _MANY_OFF:
         logger.warning(

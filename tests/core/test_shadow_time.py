@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -148,6 +149,27 @@ def test_noise_does_not_move_the_middle_of_a_soft_edge() -> None:
     assert abs(np.nanmedian(off)) < 0.1
     paper = paper_times(sweep_frames(sweep, 0.012)) - true_times(sweep)
     assert abs(np.nanmedian(paper[SCENE.plane])) > 0.15
+
+
+def test_a_trembling_camera_does_not_move_the_middle_of_a_soft_edge() -> None:
+    sweep = Sweep(0.4, speed=2.0, soft=20.0, width=50.0)
+    rng = np.random.default_rng(1)
+    grain = np.exp(0.9 * rng.standard_normal((*SCENE.lit.shape[:2], 1)))
+    grain = cv2.GaussianBlur(grain, (0, 0), 1.0)[..., np.newaxis]
+    shots, places = [], rng.normal(scale=0.25, size=(SCENE.frames_of(sweep), 2))
+    for number, (x, y) in enumerate(places):
+        shift = np.float32([[1, 0, x], [0, 1, y]])
+        moved = cv2.warpAffine(grain, shift, grain.shape[1::-1], flags=cv2.INTER_CUBIC)
+        image = SCENE.image(SCENE.sweep_beta(sweep, number)) * moved[..., np.newaxis]
+        shots.append(SCENE.noisy(image, number))
+    crossings = crossings_of(shots)
+    away = [
+        (own_times(crossings, NOISE, trembling)[0] - true_times(sweep))[SCENE.plane]
+        for trembling in (0.0, float(places.std()))
+    ]
+    ignored, minded = (abs(float(np.nanmedian(off))) for off in away)
+    assert ignored > 0.15
+    assert minded < 0.6 * ignored
 
 
 def test_own_times_lie_between_their_frames() -> None:

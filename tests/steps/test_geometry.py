@@ -278,7 +278,7 @@ def test_an_edge_that_is_not_straight_is_told_of(
 
 
 def test_a_camera_that_trembles_is_told_by_times_that_differ_by_more_than_noise(
-    tmp_path: Path, mask: str
+    tmp_path: Path, mask: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     sweep = SWEEPS["second"]
     rng = np.random.default_rng(0)
@@ -295,6 +295,8 @@ def test_a_camera_that_trembles_is_told_by_times_that_differ_by_more_than_noise(
             path = folder / f"take.{1001 + frame}.exr"
             write_exr(path, {"RGB": to_half(SCENE.noisy(image, frame))}, Header(*size))
         raised.append(scan(folder, tmp_path / "scan" / folder.name, plane=mask).figures)
+        assert ("the camera trembles" in caplog.text) == (tremble > 0)
+    assert raised[0]["trembling"] < 0.02 < 0.2 < raised[1]["trembling"]
     steady, trembling = (figures["errors_raised"] for figures in raised)
     assert steady < 1.1
     assert trembling > 1.3 * steady

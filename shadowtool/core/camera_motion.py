@@ -9,6 +9,8 @@ from shadowtool.core.half_floats import to_float
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
+# A camera's place varies by more than this, pixels, only if it isn't held firmly.
+UNSTEADY = 0.05
 # Larger frames are measured at this width; the result is in pixels of the full frame.
 _WIDTH = 640
 _TILES = 4, 3

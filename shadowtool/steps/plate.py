@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Estimator, Gain, Missing
 from shadowtool.core.beta import shadow_contrast
+from shadowtool.core.camera_motion import UNSTEADY, strips, tremble
 from shadowtool.core.exposure import common_reference, frame_gain, without_gain
 from shadowtool.core.half_floats import not_finite, shortened
 from shadowtool.core.holdout import (
@@ -205,6 +206,15 @@ def plate(
 
     for _ in ordered_map(write, products(), run.jobs):
         pass
+    if take.trembling is not None:
+        figures["trembling"] = round(take.trembling, 3)
+    if (take.trembling or 0) > UNSTEADY:
+        logger.warning(
+            "%s: the camera trembles by %.2f pixels, and plates are off where texture is strong;"
+            " hold it firmly, or stabilize the take",
+            footage.sequence.pattern,
+            take.trembling,
+        )
     if figures.get("shaded") == 0:
         logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
     elif figures.get("read_as") == UNDER_A_CARD and figures["shaded"] < _WELL_SHADED:
@@ -274,6 +284,7 @@ class _Take:
         known_gains: of the sampled frames.
         masks: their automatic holdouts on the grid, once they are known.
         gains: of the frames that were used, where they are not 1.
+        trembling: by how much the camera's place varies, pixels; None where it wasn't measured.
         not_finite: how many of their pixels are NaN or infinite.
         folder: where the automatic one is written.
     """
@@ -290,6 +301,7 @@ class _Take:
     known_gains: dict[Frame, float] = field(default_factory=dict)
     masks: dict[Frame, Bool] = field(default_factory=dict)
     gains: dict[str, float] = field(default_factory=dict)
+    trembling: float | None = None
     not_finite: dict[str, int] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
@@ -418,6 +430,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     thinned: dict[int, NDArray[np.float32]] = {}
     grids: dict[Frame, NDArray[np.float32]] = {}
     grays: dict[Frame, NDArray[np.int16]] = {}
+    rows: list[NDArray[np.float32]] = []
     width, height = take.footage.header.size
     free = min(_KEPT, _WITH_ESTIMATE - _PER_PIXEL * width * height)
     for count, item in enumerate(take.shown(chosen, with_keys=False, last=False)):
@@ -427,13 +440,15 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         frame, position = chosen[count], positions[count]
         if position in numbers:
             thinned[numbers[position]] = thin(item.values)
+        if frame in spread:
+            rows.append(strips(item.values[..., 1]))
         grids[frame] = item.grid
         if item.values.nbytes <= free:
             free -= item.values.nbytes
             take.kept[frame] = _Kept(item.values, item.grid, item.marks[0])
         elif with_levels:
             grays[frame] = keyed(item.values, item.holdout).gray
-    noise = noise_model(noise_levels(thinned))
+    noise, take.trembling = noise_model(noise_levels(thinned)), tremble(rows)
     apart = [frame for frame in grids if frame in spread]
     if take.level and apart:
         take.reference = common_reference([take.sparse(grids[frame]) for frame in apart])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Gain
 from shadowtool.core.bands import overlapping_bands
-from shadowtool.core.camera_motion import strips, tremble
+from shadowtool.core.camera_motion import UNSTEADY, strips, tremble
 from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
 from shadowtool.core.exposure import RunningGain, sampled_areas, without_gain
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
@@ -78,8 +78,6 @@ _TREMBLING, _NO_SWEEP, _ON_LINES = 2.0, 4.0, 0.5
 # Pixels of the plane are off the lines of their times by more than this, pixels; and so many are
 # only if something is wrong.
 _OFF, _MANY_OFF = 2.0, 0.06
-# The camera's place varies by more than this, pixels, only if it isn't held firmly.
-_UNSTEADY = 0.05
 # Between frames so many times further apart than usual the shadow passes more than can be told.
 _HOLE = 3.0
 # If more of the frame than this can't be told from one reading, the frames are read again.
@@ -395,7 +393,7 @@ def _advise(figures: Figures, take: str) -> None:
             take,
             figures["errors_raised"],
         )
-    if figures["trembling"] > _UNSTEADY:
+    if figures["trembling"] > UNSTEADY:
         logger.warning(
             "%s: the camera trembles by %.2f pixels, and objects are less well known; hold it"
             " firmly, or stabilize the take",

@@ -228,6 +228,23 @@ def test_a_take_without_shadow_is_told_of(
     assert "β is unknown in 100% of the picture" in caplog.text
 
 
+@pytest.mark.parametrize("amount", [0.0, 0.2])
+def test_a_camera_that_trembles_is_told_of(
+    amount: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rng = np.random.default_rng(0)
+    shots = []
+    for number in NUMBERS:
+        move = np.float32([[1, 0, rng.normal(0, amount)], [0, 1, rng.normal(0, amount)]])
+        image = picture(number).astype(np.float32)
+        moved = cv2.warpAffine(image, move, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE)
+        shots.append(moved.astype(np.float16))
+    frames = write_frames(tmp_path / "take", shots)
+    figures = plate(frames, tmp_path / "plates").figures
+    assert (figures["trembling"] > 0.05) == (amount > 0)
+    assert ("the camera trembles" in caplog.text) == (amount > 0)
+
+
 def test_sampled_frames_are_read_once_as_far_as_they_are_kept(
     takes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

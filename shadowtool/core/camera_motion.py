@@ -105,7 +105,8 @@ def tremble(frames: list[Float32]) -> float:
         places.append(place)
         errors.append(error)
     variance = np.var(places, axis=0).mean() - np.mean(errors)
-    return float(np.sqrt(max(variance, 0)))
+    # Sums come out otherwise in their last digits on other processors.
+    return round(float(np.sqrt(max(variance, 0))), 4)
 
 
 def _moved(terms: Float64, change: Float64) -> tuple[Float64, float]:

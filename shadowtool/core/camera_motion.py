@@ -95,10 +95,11 @@ def tremble(frames: list[Float32]) -> float:
     first, places, errors = frames[0], [np.zeros(2)], [0.0]
     here = np.arange(1, first.shape[2] - 1, -(-first.shape[2] // _PLACES))
     for other in frames[1:]:
-        middle = (first + other) / 2
-        across = (middle[..., here + 1] - middle[..., here - 1]).mean(axis=1) / 2
-        down = (middle[:, 1] - middle[:, 0])[:, here]
-        light, change = (part[..., here].mean(axis=1) for part in (middle, other - first))
+        with np.errstate(invalid="ignore", over="ignore"):
+            middle = (first + other) / 2
+            across = (middle[..., here + 1] - middle[..., here - 1]).mean(axis=1) / 2
+            down = (middle[:, 1] - middle[:, 0])[:, here]
+            light, change = (part[..., here].mean(axis=1) for part in (middle, other - first))
         table = np.stack([across, down, light, change], axis=-1).reshape(-1, 4).astype(np.float64)
         table = table[np.isfinite(table).all(axis=1)]
         place, error = _moved(table[:, :3], table[:, 3])

@@ -51,6 +51,14 @@ def stays_within(result, values) -> bool:
     )
 
 
+def mapped(displacement: np.ndarray) -> WarpMap:
+    """W with so much displacement, (H, W, 2), unknown where that is."""
+    unknown = np.isnan(displacement).any(axis=-1)
+    warp = warp_map.identity_map(*unknown.shape) + displacement
+    warp[unknown] = np.nan
+    return WarpMap(warp, np.where(unknown, np.inf, 0.1).astype(np.float32))
+
+
 def crossed(*grays) -> Crossings:
     finder = CrossingFinder()
     for gray in grays:
@@ -157,6 +165,25 @@ CONTRACTS = {
             and np.array_equal(np.isfinite(r[0]), np.isfinite(r[1]))
             and (np.nan_to_num(r[0]) <= 3).all()
             and (r[1] > 0).all()
+        ),
+    ),
+    "own_times of a camera that trembles": Contract(
+        lambda *grays: shadow_time.own_times(crossed(*grays), MODEL, 0.3),
+        lambda h, w: st.tuples(*(plane(h, w, TAME) for _ in range(4))),
+        lambda r, *grays: (
+            np.array_equal(np.isfinite(r[0]), crossed(*grays).at > 0)
+            and np.array_equal(np.isfinite(r[0]), np.isfinite(r[1]))
+            and (np.nan_to_num(r[0]) <= 3).all()
+            and (r[1] > 0).all()
+        ),
+    ),
+    "without_slips": Contract(
+        lambda displacement: warp_map.without_slips(mapped(displacement)),
+        lambda h, w: st.tuples(array(h, w, 2, elements=st.sampled_from([0.0, 0.5, 3.0, np.nan]))),
+        lambda r, displacement: (
+            np.array_equal(r.error, mapped(displacement).error)
+            and np.array_equal(np.isnan(r.warp), np.isnan(mapped(displacement).warp))
+            and np.abs(np.nan_to_num(r.warp)).max() < 20
         ),
     ),
     "refined_times": Contract(

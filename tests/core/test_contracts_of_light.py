@@ -308,6 +308,11 @@ CONTRACTS = {
         lambda h, w: st.tuples(halfs(h, w), st.floats(0.7, 1.4)),
         lambda r, a, gain: r.dtype == a.dtype and np.array_equal(np.isnan(r), np.isnan(a)),
     ),
+    "tremble": Contract(
+        lambda *frames: camera_motion.tremble([camera_motion.strips(f) for f in frames]),
+        lambda h, w: st.tuples(*(plane(h, w) for _ in range(3))),
+        lambda r, *frames: isinstance(r, float) and r >= 0 and np.isfinite(r),
+    ),
     "prepare": Contract(
         camera_motion.prepare,
         lambda h, w: st.tuples(plane(h, w)),

@@ -113,14 +113,15 @@ def tremble(frames: list[Float32]) -> float:
 def _moved(terms: Float64, change: Float64) -> tuple[Float64, float]:
     """The displacement (2,) that explains the change best, and its variance along an axis."""
     solved: Float64 = np.zeros(3)
-    inverse, spread = np.zeros((3, 3)), 0.0
+    inverse: Float64 = np.zeros((3, 3))
+    spread = 0.0
     for _ in range(_WEIGHED if change.size else 0):
         rest = change - terms @ solved
         spread = float(np.median(np.abs(rest))) / 0.6745 + 1e-9
         weight = np.clip(1 - (rest / (_OUT * spread)) ** 2, 0, 1) ** 2
         normal = terms.T @ (terms * weight[:, np.newaxis]) + 1e-9 * np.eye(3)
         # Of what nothing tells, as along stripes, it says that nothing moved.
-        inverse = np.linalg.pinv(normal, hermitian=True)
+        inverse = np.asarray(np.linalg.pinv(normal, hermitian=True), np.float64)
         solved = np.asarray(inverse @ (terms.T @ (weight * change)), np.float64)
     return solved[:2], float(inverse[:2, :2].trace() / 2 * spread**2)
 

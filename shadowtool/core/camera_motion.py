@@ -19,7 +19,7 @@ _LEAST_TILE = 24
 _LEAST_CORRELATION = 0.5
 # How many pairs of rows, and of places in them, tell how a camera trembles; how often what doesn't
 # fit is weighed anew, and from how many deviations on it doesn't count.
-_STRIPS, _PLACES, _WEIGHED, _OUT = 32, 256, 5, 4.7
+_STRIPS, _PLACES, _WEIGHED, _OUT = 32, 128, 4, 4.7
 # The standard error of a median, times the square root of their number, in median deviations.
 _MEDIAN_ERROR = 1.48 * 1.25
 

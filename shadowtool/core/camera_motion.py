@@ -1,4 +1,5 @@
-"""How far the camera moved between two frames of a take that should be locked off."""
+"""How far the camera moved between two frames of a take that should be locked off, and by how much
+it trembled all along."""
 
 import cv2
 import numpy as np
@@ -70,8 +71,14 @@ def shift(reference: Float32, other: Float32, width: int) -> float | None:
 
 
 def strips(gray: NDArray[np.floating]) -> Float32:
-    """What `tremble` looks at of a frame's luminance (H, W): evenly spaced pairs of neighbouring
-    rows, (K, 2, W)."""
+    """What `tremble` looks at of a frame: evenly spaced pairs of neighbouring rows.
+
+    Args:
+        gray: (H, W) float16 or float32, linear luminance or a channel; not finite unknown.
+
+    Returns:
+        (K, 2, W) float32.
+    """
     rows = np.unique(np.linspace(0, max(len(gray) - 2, 0), _STRIPS).astype(int))
     pairs = np.stack([rows, np.minimum(rows + 1, len(gray) - 1)], axis=1)
     return to_float(np.ascontiguousarray(gray[pairs]))
@@ -85,10 +92,10 @@ def tremble(frames: list[Float32]) -> float:
     and is left out.
 
     Args:
-        frames: from `strips`, spread over the take.
+        frames: from `strips`, (K, 2, W) each, spread over the take; not finite is left out.
 
     Returns:
-        Pixels; what is within the error of its measurement counts as nothing.
+        Pixels ≥ 0; what is within the error of its measurement counts as nothing.
     """
     if len(frames) < 2 or frames[0].shape[2] < 3:
         return 0.0

@@ -32,6 +32,8 @@ _DEEPEST, _LIGHTEST, _CLEAR, _BLACK = 5.0, -0.25, 8.0, 2.0
 # Of so many ratios that are frequent, each with what differs from it by this logarithm, and none
 # nearer to another than so many bins.
 _FREQUENT, _ALIKE, _BINS = 4, 0.1, 8
+# So many samples at least tell a ratio.
+_TELLING = 20
 # Ratios of shadow scatter by no more than noise and this part; and noise that widens a peak lowers
 # it by so much at most.
 _SCATTER, _LOWERED = 0.03, 2.0
@@ -165,14 +167,14 @@ def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float3
         if excess[peak] <= 0:
             break
         alike = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2) < _ALIKE
-        if alike.sum() >= 20:
+        if alike.sum() >= _TELLING:
             ratio, scatter, noisy = _told(stack, bright, alike, noise)
             lowered = min(float(np.hypot(1, noisy / _ALIKE)), _LOWERED)
             if (weight := excess[peak] * lowered / scatter) > best:
                 found, best, usual = ratio, weight, alike.sum() / scatter
         excess[max(peak - _BINS, 0) : peak + _BINS + 1] = -np.inf
     black = difference <= -_DEEPEST
-    if black.sum() > max(_BLACK * usual, 20):
+    if black.sum() > max(_BLACK * usual, _TELLING):
         found, *_ = _told(stack, bright, black, noise)
     return found
 

@@ -160,9 +160,13 @@ def own_times(
     cuts = list(bands(known.shape, _ARRAYS))
     ends = (crossings.highest, crossings.lowest) if trembling else ()
     rough = [np.float32(trembling) * _slope(end) for end in ends]
+
+    def extremes(rows: slice) -> tuple[Float32, Float32, Float32, Float32, Float32]:
+        return _extremes(crossings.part(rows), noise, [texture[rows] for texture in rough])
+
     for rows in cuts:
         part = crossings.part(rows)
-        lit, dark, contrast, *sigmas = _extremes(part, noise, [texture[rows] for texture in rough])
+        lit, dark, contrast, *sigmas = extremes(rows)
         passed = (lost, lit - part.before), (left, part.after - dark)
         for (values, of), count, sigma in zip(passed, counts, sigmas, strict=True):
             seen = np.minimum(np.fmax(of / contrast, 0), 1)
@@ -187,8 +191,7 @@ def own_times(
     time, error = np.empty_like(lost), np.empty_like(lost)
     for rows in cuts:
         caught = lost[rows], left[rows]
-        extremes = _extremes(crossings.part(rows), noise, [texture[rows] for texture in rough])
-        told = _told(crossings.part(rows), extremes, caught, duration[rows])
+        told = _told(crossings.part(rows), extremes(rows), caught, duration[rows])
         time[rows] = np.where(known[rows], told[0], np.float32(np.nan))
         error[rows] = np.where(known[rows], told[1], np.float32(np.inf))
     return time, error, duration

@@ -166,16 +166,16 @@ def without_slips(found: WarpMap) -> WarpMap:
     surface is a single pixel large.
 
     Args:
-        found: as measured, not filled in.
+        found: as measured, (H, W, 2) and (H, W) in pixels, NaN and infinite unknown; not filled in.
 
     Returns:
-        Median displacement and error of the pixels around, where a pixel has slipped.
+        Median displacement and error of the pixels around, where a pixel has slipped; all else as
+        it was, bit for bit.
     """
     height, width = found.error.shape
     here = identity_map(height, width)
     displacement = np.nan_to_num(found.warp - here, nan=_FAR)
-    usual = [cv2.medianBlur(np.ascontiguousarray(part), 3) for part in cv2.split(displacement)]
-    off = np.hypot(*(part - own for part, own in zip(cv2.split(displacement), usual, strict=True)))
+    off = np.hypot(*(part - cv2.medianBlur(part, 3) for part in cv2.split(displacement)))
     # Where enough of them agree, the median of all nine lies among them.
     off[(off <= _SLIPPED / 2) | np.isinf(found.error)] = 0
     off[[0, -1]], off[:, [0, -1]] = 0, 0

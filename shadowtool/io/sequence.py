@@ -133,7 +133,7 @@ def open_sequence(source: str | Path, role: str = "frames") -> Sequence:
     """
     text = os.fspath(source)
     if not text:
-        raise InputError(f"no file or folder is named{_for(role) or ' for the frames'}")
+        raise InputError(f"no file or folder is named for the {role}")
     path = Path(text)
     try:
         if path.is_dir():
@@ -164,7 +164,7 @@ def parse_frames(text: str) -> list[Frame]:
         frames = _frames(FrameSet(",".join(parts))) if whole else []
     except (FileSeqException, ValueError, TypeError, ArithmeticError):
         frames = []
-    if not frames or not all(frame_number(str(frame)) is not None for frame in frames):
+    if not frames or any(frame_number(str(frame)) is None for frame in frames):
         raise OptionError(
             f"--frames {_short(text)}: not a frame range; write 1001-1048, 1001-1048x2 or 1,5,9-20"
         )

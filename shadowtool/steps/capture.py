@@ -7,7 +7,6 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from shadowtool.choices import Format
 from shadowtool.core import camera_motion
 from shadowtool.core.half_floats import LARGEST_HALF, not_finite
 from shadowtool.core.noise import NoiseSamples, noise_levels
+from shadowtool.core.resizing import resized
 from shadowtool.core.shadow_time import luminance
 from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import (
@@ -321,7 +321,7 @@ class _Taking:
         if (crop := self.crop) is not None:
             values = values[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
         if (values.shape[1], values.shape[0]) != self.size:
-            values = _resized(np.ascontiguousarray(values), self.size)
+            values = resized(values, self.size)
         return values
 
     def kept(self, mark: str) -> Result | None:
@@ -429,23 +429,3 @@ def _moved(name: str, motion: dict[str, Any]) -> str:
         f" {motion.get('largest')} pixels in frame {motion.get('largest_at')};"
         " stabilise the take or shoot it again"
     )
-
-
-def _resized(image: Float32, size: tuple[int, int]) -> Float32:
-    """A picture (H, W, 3) at another size (width, height). What is not finite makes nothing else
-    so: pixels around it are made of those that are."""
-    method = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_CUBIC
-    bad = not_finite(image)
-    if bad is None:
-        return np.asarray(cv2.resize(image, size, interpolation=method), np.float32)
-    good = (~bad).astype(np.float32)
-    whole = np.where(bad[..., np.newaxis], np.float32(0), image)
-    values, weight = (
-        np.asarray(cv2.resize(part, size, interpolation=method), np.float32)
-        for part in (whole, good)
-    )
-    lost = cv2.resize(good, size, interpolation=cv2.INTER_NEAREST) == 0
-    lost |= weight < 0.5
-    values /= np.where(lost, np.float32(1), weight)[..., np.newaxis]
-    values[lost] = np.nan
-    return values

@@ -208,13 +208,13 @@ def plate(
         pass
     if take.trembling is not None:
         figures["trembling"] = round(take.trembling, 3)
-    if (take.trembling or 0) > UNSTEADY:
-        logger.warning(
-            "%s: the camera trembles by %.2f pixels, and plates are off where texture is strong;"
-            " hold it firmly, or stabilize the take",
-            footage.sequence.pattern,
-            take.trembling,
-        )
+        if take.trembling > UNSTEADY:
+            logger.warning(
+                "%s: the camera trembles by %.2f pixels, and plates are off where texture is"
+                " strong; hold it firmly, or stabilize the take",
+                footage.sequence.pattern,
+                take.trembling,
+            )
     if figures.get("shaded") == 0:
         logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
     elif figures.get("read_as") == UNDER_A_CARD and figures["shaded"] < _WELL_SHADED:

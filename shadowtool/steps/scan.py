@@ -203,12 +203,11 @@ class _Reading(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What is taken from a frame."""
+    """What is taken from a frame; of sampled ones thinned colours and rows, too."""
 
     gray: Float16
     areas: Float32
-    sample: Float32 | None
-    strips: Float32 | None
+    sample: tuple[Float32, Float32] | None
     picture: UInt8 | None
     mark: str
 
@@ -224,39 +223,38 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
                 return None
             raise
         colours = image.colours(footage.transfer)
-        sample = rows = picture = None
+        sample = picture = None
         if position == 0:
             picture = np.stack([display(plane) for plane in colours], axis=-1)
         gray = luminance_halfs(*colours)
         if position in samples.values():
-            sample = np.stack([thin(plane) for plane in colours], axis=-1)
-            rows = strips(gray)
-        return _Seen(gray, sampled_areas(gray), sample, rows, picture, image.fingerprint)
+            sample = np.stack([thin(plane) for plane in colours], axis=-1), strips(gray)
+        return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
 
     finder, exposure = CrossingFinder(), RunningGain()
     marks, gains, bad = list[str](), dict[Frame, float](), dict[str, int]()
     thinned: dict[int, Float32] = {}
-    seen_rows: list[Float32] = []
+    rows: list[Float32] = []
     first: UInt8 | None = None
     run.progress(0, len(frames))
     for position, item in enumerate(ordered_map(read, range(len(frames)), run.jobs)):
         if item is not None:
-            gray, areas, sample, rows, picture, mark = item
+            gray, areas, sample, picture, mark = item
             first = first if picture is None else picture
             own = exposure.add(areas) if gain == "auto" else 1.0
             bad[str(frames[position])] = finder.add(without_gain(gray, own))
             marks.append(mark)
             gains[frames[position]] = own
             if sample is not None:
-                level = without_gain(sample, own)
-                seen_rows += [] if rows is None else [rows]
+                level = without_gain(sample[0], own)
+                rows.append(sample[1])
                 thinned |= {n: level for n, where in samples.items() if where == position}
         run.progress(position + 1, len(frames))
     if len(gains) < 3:
         raise DamagedFileError(f"{footage.sequence.pattern}: too few frames can be read")
 
     def measure() -> tuple[NoiseModel, float]:
-        return noise_model(noise_levels(thinned)), tremble(seen_rows)
+        return noise_model(noise_levels(thinned)), tremble(rows)
 
     with meanwhile(measure) as measured:
         found = finder.found()

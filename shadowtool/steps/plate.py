@@ -122,7 +122,9 @@ def plate(
 
     written = [_place(output / HOLDOUT_FOLDER, frame) for frame in frames] if automatic else []
     refuse_existing([*plate_files(output), output / MANIFEST, *written], run)
-    read = [*footage.sequence.files.values(), *([] if plane is None else [Path(plane)])]
+    read = [Path(plane)] if plane else []
+    for sequence in filter(None, (footage.sequence, held)):
+        read += sequence.files.values()
     refuse_inputs([*plate_files(output), *written], read)
     refuse_other_step("plate", output, run)
     inputs = {"frames": Path(footage.sequence.pattern).name}

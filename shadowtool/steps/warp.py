@@ -35,7 +35,7 @@ from shadowtool.io.image import (
     write_exr,
     write_png,
 )
-from shadowtool.io.products import MANIFEST, WARP, read_scan, read_warp, write_warp
+from shadowtool.io.products import MANIFEST, WARP, read_record, read_scan, read_warp, write_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_size
 from shadowtool.steps.run import (
@@ -120,14 +120,23 @@ def warp(
         return [_apply(map_file, applied, record_in, run, outside)]
     results = [_solve(scans, source_scans or [], output, run, iterations)]
     if not results[0].kept:
-        # What the map that was there before was applied to.
-        folders = {record.parent for record in output.glob(f"*/{MANIFEST}")}
-        for folder in sorted(folders - ({applied.folder} if applied else set())):
+        now = {applied.folder} if applied else set()
+        for folder in sorted(_applied_before(output) - now):
             warn_of_left(sorted(folder.glob(f"*{EXR}")))
     if applied is not None:
         folder = output / applied.sequence.name
         results.append(_apply(output / WARP, applied, folder, run, outside))
     return results
+
+
+def _applied_before(output: Path) -> set[Path]:
+    """The folders of frames as an earlier map saw them."""
+    records = {record.parent: read_record(record) for record in output.glob(f"*/{MANIFEST}")}
+    return {
+        folder
+        for folder, record in records.items()
+        if record.get("step") == "warp" and "--apply" in str(record.get("command"))
+    }
 
 
 @dataclass(frozen=True)

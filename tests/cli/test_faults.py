@@ -551,9 +551,17 @@ def test_nothing_given_is_written_over(shot, command, copied, tree):
         frame(lit, number).rename(lit / f"{'lit' if number == 1001 else f'lit.{number}'}.exr")
     (lit / "scan.png").write_bytes((shot.folder / "mask.png").read_bytes())
     words = ["--fg", plain[0], "--beta-frames", plain[1], "--plates", shot.plates]
+    # Of a still, whose frame has no number.
+    held = lit.parent / "held"
+    held.mkdir()
+    nothing = np.zeros((HEIGHT, WIDTH), np.float16)
+    write_exr(held / "lit.exr", {"Y": nothing}, Header(WIDTH, HEIGHT))
+    still = lit.parent / "still.exr"
+    still.write_bytes((lit / "lit.exr").read_bytes())
     for folder, arguments in (
         (plain[0], ["composite", *words]),
         (lit, ["plate", lit / "lit.exr"]),
+        (held, ["plate", still, "--holdout", held / "lit.exr"]),
         (lit, ["scan", shot.sweep1, "--plane", lit / "scan.png"]),
     ):
         before = tree(folder)
@@ -656,6 +664,14 @@ def test_what_a_run_leaves_of_another_is_named(name, before, after, left, shot, 
     outcome = command(*words, *given(after), "-o", output, "--overwrite")
     assert outcome.code == 0
     assert f"{left}: left from an earlier run" in outcome.err
+
+
+def test_a_map_beside_other_steps_folders_leaves_none_of_them(shot, command, copied):
+    root = copied("matte").parent
+    copied("scan1")
+    outcome = command(*shot.arguments("warp"), "-o", root)
+    assert outcome.code == 0
+    assert "left from" not in outcome.err
 
 
 def test_holdouts_that_are_damaged_are_made_again(shot, command, tmp_path, tree):

@@ -8,8 +8,10 @@ from shadowtool.core import beta, camera_motion, compositing, exposure, filling,
 from shadowtool.core.half_floats import all_finite, to_float, to_half
 from shadowtool.core.holdout import grid_step
 from shadowtool.core.plates import ExtremePlates, Plates
+from shadowtool.core.resizing import resized
 from shadowtool.core.transfer import TRANSFERS
 from tests.core.contracts import (
+    SIZES,
     TAME,
     UNIT,
     WILD,
@@ -312,6 +314,16 @@ CONTRACTS = {
         lambda *frames: camera_motion.tremble([camera_motion.strips(f) for f in frames]),
         lambda h, w: st.tuples(*(plane(h, w) for _ in range(3))),
         lambda r, *frames: isinstance(r, float) and r >= 0 and np.isfinite(r),
+    ),
+    "resized": Contract(
+        resized,
+        lambda h, w: st.tuples(picture(h, w), SIZES),
+        lambda r, image, size: (
+            is_single(r, size[1], size[0], 3)
+            and not np.isinf(r).any()
+            and (np.isfinite(r).all() or not np.isfinite(image).all())
+            and np.array_equal(np.isnan(r).any(axis=-1), np.isnan(r).all(axis=-1))
+        ),
     ),
     "prepare": Contract(
         camera_motion.prepare,

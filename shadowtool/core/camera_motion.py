@@ -71,17 +71,20 @@ def shift(reference: Float32, other: Float32, width: int) -> float | None:
 
 
 def strips(gray: NDArray[np.floating]) -> Float32:
-    """What `tremble` looks at of a frame: evenly spaced pairs of neighbouring rows.
+    """What `tremble` looks at of a frame: evenly spaced places in pairs of neighbouring rows, each
+    between the pixels on its left and right.
 
     Args:
         gray: (H, W) float16 or float32, linear luminance or a channel; not finite unknown.
 
     Returns:
-        (K, 2, W) float32.
+        (K, 2, P, 3) float32; P is 0 of less than three columns.
     """
     rows = np.unique(np.linspace(0, max(len(gray) - 2, 0), _STRIPS).astype(int))
     pairs = np.stack([rows, np.minimum(rows + 1, len(gray) - 1)], axis=1)
-    return to_float(np.ascontiguousarray(gray[pairs]))
+    width = gray.shape[1]
+    columns = np.arange(1, width - 1, -(-width // _PLACES))[:, np.newaxis] + (-1, 0, 1)
+    return to_float(gray[pairs[..., np.newaxis, np.newaxis], columns])
 
 
 def tremble(frames: list[Float32]) -> float:
@@ -92,21 +95,20 @@ def tremble(frames: list[Float32]) -> float:
     and is left out.
 
     Args:
-        frames: from `strips`, (K, 2, W) each, spread over the take; not finite is left out.
+        frames: from `strips`, (K, 2, P, 3) each, spread over the take; not finite is left out.
 
     Returns:
         Pixels ≥ 0; what is within the error of its measurement counts as nothing.
     """
-    if len(frames) < 2 or frames[0].shape[2] < 3:
+    if len(frames) < 2:
         return 0.0
     first, places, errors = frames[0], [np.zeros(2)], [0.0]
-    here = np.arange(1, first.shape[2] - 1, -(-first.shape[2] // _PLACES))
     for other in frames[1:]:
         with np.errstate(invalid="ignore", over="ignore"):
             middle = (first + other) / 2
-            across = (middle[..., here + 1] - middle[..., here - 1]).mean(axis=1) / 2
-            down = (middle[:, 1] - middle[:, 0])[:, here]
-            light, change = (part[..., here].mean(axis=1) for part in (middle, other - first))
+            across = (middle[..., 2] - middle[..., 0]).mean(axis=1) / 2
+            down = middle[:, 1, :, 1] - middle[:, 0, :, 1]
+            light, change = (part[..., 1].mean(axis=1) for part in (middle, other - first))
         table = np.stack([across, down, light, change], axis=-1).reshape(-1, 4).astype(np.float64)
         table = table[np.isfinite(table).all(axis=1)]
         place, error = _moved(table[:, :3], table[:, 3])

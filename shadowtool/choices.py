@@ -12,6 +12,7 @@ Format = Literal["exr", "png"]
 Gain = Literal["auto", "none"]
 Missing = Literal["error", "skip"]
 Only = Literal["trimap", "alpha", "beta"]
+Steady = Literal["auto", "none"]
 TransferName = Literal["auto", "linear", "srgb", "rec709", "none"]
 Progress = Literal["auto", "bar", "plain", "openjd", "none"]
 
@@ -22,5 +23,6 @@ FORMATS: tuple[str, ...] = get_args(Format)
 GAINS: tuple[str, ...] = get_args(Gain)
 MISSING: tuple[str, ...] = get_args(Missing)
 ONLY: tuple[str, ...] = get_args(Only)
+STEADY: tuple[str, ...] = get_args(Steady)
 TRANSFER_NAMES: tuple[str, ...] = get_args(TransferName)
 PROGRESS: tuple[str, ...] = get_args(Progress)

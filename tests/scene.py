@@ -90,3 +90,14 @@ class Scene:
         rng = np.random.default_rng(seed)
         spread = sigma * np.sqrt(np.maximum(image, 0.01) / 0.18)
         return (image + rng.normal(size=image.shape) * spread).astype(np.float32)
+
+
+def waves(x: float, y: float) -> np.ndarray:
+    """A texture, (240, 320), moved by any part of a pixel."""
+    rng = np.random.default_rng(4)
+    rows, columns = np.mgrid[:240, :320]
+    total = np.zeros((240, 320))
+    for _ in range(40):
+        a, b, phase = rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8), rng.uniform(0, 7)
+        total += np.sin(a * (columns - x) + b * (rows - y) + phase)
+    return 0.5 * np.exp(0.05 * total)

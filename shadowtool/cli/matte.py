@@ -6,7 +6,13 @@ from typing import Any
 import click
 
 from shadowtool.choices import BETAS, FILLS, ONLY
-from shadowtool.cli.options import folder_option, gain_option, step_command, transfer_option
+from shadowtool.cli.options import (
+    folder_option,
+    gain_option,
+    steady_option,
+    step_command,
+    transfer_option,
+)
 
 
 @click.command()
@@ -46,6 +52,7 @@ from shadowtool.cli.options import folder_option, gain_option, step_command, tra
     " hides are continued from around them, regions that no shadow ever reached are lit.",
 )
 @gain_option
+@steady_option
 @transfer_option
 @step_command
 def command(source: str, output: Path, **options: Any) -> list[Any]:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import click
 
-from shadowtool.choices import FORMATS, GAINS, MISSING, PROGRESS, TRANSFER_NAMES
+from shadowtool.choices import FORMATS, GAINS, MISSING, PROGRESS, STEADY, TRANSFER_NAMES
 from shadowtool.cli.progress import reporter
 from shadowtool.cli.report import report
 
@@ -92,6 +92,15 @@ gain_option = click.option(
     show_default=True,
     help="Light that changes over the take. auto: each frame's exposure is found from the pixels"
     " that agree, taken out and recorded. none: frames are taken as they are.",
+)
+steady_option = click.option(
+    "--steady",
+    type=click.Choice(STEADY),
+    default="auto",
+    show_default=True,
+    help="A camera that trembles. auto: if it does, frames are moved by parts of a pixel to where"
+    " one place sees the scene from, and that is said and recorded. none: frames are taken as they"
+    " are.",
 )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from shadowtool.choices import ESTIMATORS
-from shadowtool.cli.options import gain_option, step_command, transfer_option
+from shadowtool.cli.options import gain_option, steady_option, step_command, transfer_option
 
 
 @click.command()
@@ -35,6 +35,7 @@ from shadowtool.cli.options import gain_option, step_command, transfer_option
     " shadow reached less than most of it.",
 )
 @gain_option
+@steady_option
 @transfer_option
 @step_command
 def command(source: str, output: Path, **options: Any) -> list[Any]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from shadowtool.cli.options import gain_option, step_command, transfer_option
+from shadowtool.cli.options import gain_option, steady_option, step_command, transfer_option
 
 
 @click.command()
@@ -17,6 +17,7 @@ from shadowtool.cli.options import gain_option, step_command, transfer_option
     help='Where the reference plane is: a mask of the frames\' size, or "x,y x,y x,y ...".',
 )
 @gain_option
+@steady_option
 @transfer_option
 @step_command
 def command(source: str, output: Path, **options: Any) -> list[Any]:

@@ -2,13 +2,15 @@
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Missing
+from shadowtool.core.camera_motion import Place, Vantage, displaced
 from shadowtool.core.noise import (
     NoiseModel,
     noise_levels,
@@ -16,6 +18,7 @@ from shadowtool.core.noise import (
     sample_positions,
     thin,
 )
+from shadowtool.core.trembling import strips
 from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
 from shadowtool.io.products import StoredPlates
@@ -23,6 +26,15 @@ from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
 
 logger = logging.getLogger(__name__)
+
+Float32 = NDArray[np.float32]
+
+
+class Survey(NamedTuple):
+    """What a few frames spread over a take tell of it: its noise, and their rows as of `strips`."""
+
+    noise: NoiseModel
+    rows: list[Float32]
 
 
 @dataclass(frozen=True)
@@ -33,11 +45,13 @@ class Footage:
         sequence: the frames' files.
         header: the first frame's.
         transfer: the transfer function's name.
+        vantage: where all frames are seen from; None for each from its own place.
     """
 
     sequence: Sequence
     header: Header
     transfer: str
+    vantage: Vantage | None = None
 
     def image(self, frame: Frame, apart: bool = False) -> Image:
         """Read a frame.
@@ -53,27 +67,47 @@ class Footage:
         return image
 
     def read(self, frame: Frame) -> NDArray[np.floating]:
-        """(H, W, 3) linear light; float16 where the file holds linear halfs."""
-        return self.image(frame).rgb(self.transfer)
+        """(H, W, 3) linear light, from the vantage; float16 where the file holds linear halfs."""
+        return self.light(self.image(frame))
 
-    def measure_noise(self, jobs: int | None = None) -> NoiseModel:
-        """The take's noise, from pairs of neighbouring frames spread over the whole of it.
+    def light(self, image: Image) -> NDArray[np.floating]:
+        """The same of a frame that was read."""
+        values = image.rgb(self.transfer)
+        return displaced(values, self.off(values))
 
-        It does not depend on which frames a run is asked for.
-        """
+    def off(self, light: NDArray[np.floating]) -> Place:
+        """How far a frame's light, (H, W) or (H, W, 3), is off what the vantage sees, as of
+        `Vantage.off`."""
+        return (0.0, 0.0) if self.vantage is None else self.vantage.off(light)
+
+    def steadied(self, frames: list[Frame], jobs: int | None = None) -> "Footage":
+        """The same take seen from one place, the middle of those that these frames, all of which
+        can be read, are seen from."""
+        vantage = Vantage.of(self.read(frames[0]))
+        places = ordered_map(lambda frame: vantage.off(self.read(frame)), frames, jobs)
+        return replace(self, vantage=vantage.amid(list(places)))
+
+    def survey(self, jobs: int | None = None) -> Survey:
+        """What frames spread over the whole take tell; it does not depend on which of them a run
+        is asked for."""
         frames = self.sequence.frames
         positions = sample_positions(len(frames))
         wanted = [frames[position] for position in positions.values()]
-        thinned = ordered_map(self._sample, wanted, jobs)
-        samples = {number: t for number, t in zip(positions, thinned, strict=True) if t is not None}
-        return noise_model(noise_levels(samples))
+        samples: dict[int, Float32] = {}
+        rows = []
+        for number, sample in zip(positions, ordered_map(self._sample, wanted, jobs), strict=True):
+            if sample is not None:
+                samples[number], own_rows = sample
+                rows.append(own_rows)
+        return Survey(noise_model(noise_levels(samples)), rows)
 
-    def _sample(self, frame: Frame) -> NDArray[np.float32] | None:
+    def _sample(self, frame: Frame) -> tuple[Float32, Float32] | None:
         try:
-            return thin(self.read(frame))
+            light = self.read(frame)
         except DamagedFileError:
             # Said where the frame itself is worked on.
             return None
+        return thin(light), strips(light[..., 1])
 
 
 def open_footage(

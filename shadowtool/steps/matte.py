@@ -2,18 +2,19 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.choices import Beta, Fill, Gain, Only
+from shadowtool.choices import Beta, Fill, Gain, Only, Steady
 from shadowtool.core import beta as shadow_beta
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.boxes import Box, around
+from shadowtool.core.camera_motion import Place, Vantage, displaced
 from shadowtool.core.exposure import frame_gain, without_gain
 from shadowtool.core.half_floats import not_finite, to_float
 from shadowtool.core.holdout import grid_step, on_grid
@@ -27,6 +28,7 @@ from shadowtool.core.matting import (
 )
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.plates import Plates
+from shadowtool.core.trembling import UNSTEADY, off_place, strips
 from shadowtool.core.trimap import FIGURE
 from shadowtool.errors import OptionError
 from shadowtool.io.files import real
@@ -80,6 +82,7 @@ def matte(
     clamp: bool = True,
     fill: Fill = "inpaint",
     gain: Gain = "auto",
+    steady: Steady = "auto",
     transfer: str = "auto",
 ) -> Result:
     """Write ``trimap/``, ``fg/`` (αF and α) and ``beta/`` (β and its confidence).
@@ -94,6 +97,8 @@ def matte(
         clamp: keep β within 0 and 1; caustics are above.
         fill: what unknown β becomes.
         gain: find each frame's exposure against the plates and take it out, or take it as it is.
+        steady: of a camera that trembles, move frames to where the plates see the scene from, or
+            take them as they are.
 
     Raises:
         InputError: frames, plates, mattes are missing or don't fit.
@@ -118,7 +123,16 @@ def matte(
     if "alpha" in given:
         pattern = footage.sequence.pattern
         require_frames(given["alpha"], frames, footage.header, pattern, run.missing)
-    noise = footage.measure_noise(run.jobs)
+    noise, rows = footage.survey(run.jobs)
+    off = off_place(strips(stored.plates.lit[..., 1]), rows) if steady == "auto" else 0.0
+    if off > UNSTEADY:
+        logger.warning(
+            "%s: the camera is off the plates' place by %.2f pixels; frames are moved there",
+            footage.sequence.pattern,
+            off,
+        )
+        footage = replace(footage, vantage=Vantage.of(stored.plates.lit))
+        noise = footage.survey(run.jobs).noise
     recipe = Recipe(
         "matte",
         {
@@ -127,6 +141,7 @@ def matte(
             "fill": fill,
             "gain": gain,
             "only": only,
+            "steady": steady,
             "transfer": footage.transfer,
             "noise": [[float(v) for v in row] for row in (noise.slope, noise.floor)],
         },
@@ -225,12 +240,14 @@ class _Shown(NamedTuple):
         header: the file's.
         bad: (H, W), where it is not finite; None for nowhere.
         gain: how much brighter than the plates it is.
+        moved: from where it was seen to where the plates see it from, (x, y) in pixels.
     """
 
     light: NDArray[np.floating]
     header: Header
     bad: Bool | None
     gain: float
+    moved: Place
 
     def at(self, box: Box) -> Float32:
         """A part of it at gain 1, NaN where it is not finite."""
@@ -308,6 +325,7 @@ class _Take:
             "hidden": int(np.count_nonzero(hidden)),
             "not_finite": 0 if shown.bad is None else int(np.count_nonzero(shown.bad)),
             "gain": round(shown.gain, 6),
+            "moved": round(float(np.hypot(*shown.moved)), 3),
         }
         marked, header = with_figures(provenance, figures), shown.header
         # The encoder wants the room.
@@ -333,7 +351,8 @@ class _Take:
             name: round(sum(int(row.get(name, 0)) for row in rows) / pixels, 5) for name in names
         }
         gains = [float(row.get("gain", 1)) for row in rows] or [1.0]
-        return parts | {"gain": {"least": min(gains), "most": max(gains)}}
+        moved = max((float(row.get("moved", 0)) for row in rows), default=0.0)
+        return parts | {"gain": {"least": min(gains), "most": max(gains)}, "moved": moved}
 
     def _file(self, product: Only, frame: Frame) -> Path:
         folder, suffix = PRODUCTS[product]
@@ -342,16 +361,18 @@ class _Take:
     def _shown(self, frame: Frame) -> _Shown:
         stored = self.footage.image(frame)
         light = stored.rgb(self.footage.transfer)
+        place = self.footage.off(light)
+        light = displaced(light, place)
         bad = not_finite(light)
         gain = 1.0
         if self.gain == "auto":
             with np.errstate(invalid="ignore"):
                 gain = frame_gain(on_grid(light, self.scene.step), self.scene.reference)
-        return _Shown(light, stored.header, bad, gain)
+        return _Shown(light, stored.header, bad, gain, place)
 
     def _figure(self, frame: Frame, shown: _Shown) -> _Figure:
         if self.alpha is not None:
-            matte = _matte_plane(self.alpha.path(frame))
+            matte = displaced(_matte_plane(self.alpha.path(frame)), shown.moved).astype(np.float32)
             box = around(matte > 0, MARGIN) or _NONE
             alpha, image = matte[box].copy(), shown.at(box)
             backdrop, unknown = self.scene.backdrop.at(box), self.scene.unknown[box]

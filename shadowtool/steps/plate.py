@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.choices import Estimator, Gain, Missing
+from shadowtool.choices import Estimator, Gain, Missing, Steady
 from shadowtool.core.beta import shadow_contrast
-from shadowtool.core.camera_motion import UNSTEADY, strips, tremble
 from shadowtool.core.exposure import common_reference, frame_gain, without_gain
 from shadowtool.core.half_floats import not_finite, shortened
 from shadowtool.core.holdout import (
@@ -35,6 +34,7 @@ from shadowtool.core.robust_plates import (
     hide,
     keyed,
 )
+from shadowtool.core.trembling import UNSTEADY, strips, tremble
 from shadowtool.errors import DamagedFileError, InputError, OptionError
 from shadowtool.io.files import fingerprint_file, make_folder, new_folders, real
 from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
@@ -88,6 +88,7 @@ def plate(
     estimator: Estimator = "robust",
     plane: str | None = None,
     gain: Gain = "auto",
+    steady: Steady = "auto",
     transfer: str = "auto",
 ) -> Result:
     """Write ``lit.exr``, ``shadow.exr`` and ``confidence.exr``.
@@ -101,6 +102,8 @@ def plate(
         gain: find each frame's exposure and take it out, or take frames as they are. Always as
             they are with ``minmax``.
         plane: mask image or polygon of the plane that the shadow falls on, for ``robust``.
+        steady: of a camera that trembles, move frames to one place, or take them as they are.
+            Always as they are with ``minmax``.
 
     Raises:
         InputError: frames, holdout or mask are missing or don't fit.
@@ -136,6 +139,7 @@ def plate(
         "estimator": estimator,
         "transfer": footage.transfer,
         "gain": gain if estimator == "robust" else "none",
+        "steady": steady if estimator == "robust" else "none",
         "holdout": Path(held.pattern).name if held is not None else str(holdout),
     }
     recipe = Recipe("plate", parameters, inputs)
@@ -163,6 +167,7 @@ def plate(
         run,
         held,
         parameters["gain"] == "auto",
+        parameters["steady"] == "auto",
         output / HOLDOUT_FOLDER,
         recipe.provenance(recipe.fingerprint([])),
     )
@@ -212,10 +217,12 @@ def plate(
         figures["trembling"] = round(take.trembling, 3)
         if take.trembling > UNSTEADY:
             logger.warning(
-                "%s: the camera trembles by %.2f pixels, and plates are off where texture is"
-                " strong; hold it firmly, or stabilize the take",
+                "%s: the camera trembles by %.2f pixels; %s",
                 footage.sequence.pattern,
                 take.trembling,
+                "plates are off where texture is strong"
+                if take.footage.vantage is None
+                else "frames are moved to one place",
             )
     if figures.get("shaded") == 0:
         logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
@@ -281,6 +288,7 @@ class _Take:
         held: a holdout that was given.
         background: what the automatic one goes by, once it is known; None for none.
         level: whether changes of exposure are taken out.
+        steady: whether frames are moved to one place if the camera trembles.
         reference: what exposure is measured against, on its grid; None until it is known.
         kept: sampled frames that need not be read again.
         known_gains: of the sampled frames.
@@ -295,6 +303,7 @@ class _Take:
     run: Run
     held: Sequence | None
     level: bool
+    steady: bool
     folder: Path
     provenance: dict[str, str]
     background: Background | None = None
@@ -347,7 +356,7 @@ class _Take:
                     values, grid, mark = self.kept.pop(frame) if last else self.kept[frame]
                 else:
                     image = self.footage.image(frame)
-                    values, mark = image.rgb(self.footage.transfer), image.fingerprint
+                    values, mark = self.footage.light(image), image.fingerprint
                     needed = not last or self.reference is not None or self.background is not None
                     grid = self.grid(values) if needed else _NO_GRID
                 gain = self.gain(frame, grid)
@@ -450,8 +459,14 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
             take.kept[frame] = _Kept(item.values, item.grid, item.marks[0])
         elif with_levels:
             grays[frame] = keyed(item.values, item.holdout).gray
-    noise, take.trembling = noise_model(noise_levels(thinned)), tremble(rows)
+    noise = noise_model(noise_levels(thinned))
     apart = [frame for frame in grids if frame in spread]
+    if take.footage.vantage is None:
+        take.trembling = tremble(rows)
+        if take.steady and take.trembling > UNSTEADY:
+            take.kept.clear()
+            take.footage = take.footage.steadied(apart, take.run.jobs)
+            return _sample(take, frames, automatic, with_levels)
     if take.level and apart:
         take.reference = common_reference([take.sparse(grids[frame]) for frame in apart])
     gains = {frame: take.gain(frame, grid) for frame, grid in grids.items()}

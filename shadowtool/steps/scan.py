@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.choices import Gain
+from shadowtool.choices import Gain, Steady
 from shadowtool.core.bands import overlapping_bands
-from shadowtool.core.camera_motion import UNSTEADY, strips, tremble
+from shadowtool.core.camera_motion import displaced
 from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
 from shadowtool.core.exposure import RunningGain, sampled_areas, without_gain
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
@@ -37,6 +37,7 @@ from shadowtool.core.shadow_time import (
     time_windows,
     usual_loss,
 )
+from shadowtool.core.trembling import UNSTEADY, strips, tremble
 from shadowtool.core.warp_map import Pass
 from shadowtool.errors import DamagedFileError, InputError, ReshootError
 from shadowtool.io.files import fingerprint_file, make_folder
@@ -91,6 +92,7 @@ def scan(
     plane: str,
     run: Run = Run(),
     gain: Gain = "auto",
+    steady: Steady = "auto",
     transfer: str = "auto",
 ) -> Result:
     """Write ``scan.exr`` (times, their errors, contrast), ``lines.json`` and a picture of both.
@@ -99,6 +101,7 @@ def scan(
         plane: the reference plane region: a mask image (above half is inside), or a polygon
             ``x,y x,y x,y …`` in pixels.
         gain: follow the light's changes and take them out, or take frames as they are.
+        steady: of a camera that trembles, move frames to one place, or take them as they are.
 
     Raises:
         InputError: frames or mask are missing or don't fit.
@@ -116,7 +119,7 @@ def scan(
     refuse_inputs(products, [*footage.sequence.files.values(), Path(plane)])
     recipe = Recipe(
         "scan",
-        {"gain": gain, "transfer": footage.transfer},
+        {"gain": gain, "steady": steady, "transfer": footage.transfer},
         {"frames": Path(footage.sequence.pattern).name, "--plane": plane_name},
     )
     refuse_other_step("scan", output, run)
@@ -127,7 +130,13 @@ def scan(
         figures = unchanged(output, products, mark)
         if figures is not None:
             return Result("scan", output, frames, len(frames), absent, figures)
-    crossings, noise, trembling, marks, gains, bad, first = _crossings(footage, frames, gain, run)
+    reading = _crossings(footage, frames, gain, run)
+    trembling = reading.trembling
+    if steady == "auto" and trembling > UNSTEADY:
+        footage = footage.steadied(reading.sampled, run.jobs)
+        reading = _crossings(footage, list(reading.gains), gain, run)
+    crossings, noise, remaining, marks, gains, bad, first, _ = reading
+    del reading
     warn_of_nan(output, bad)
     used = list(gains)
     skipped = [*absent, *(frame for frame in frames if frame not in used)]
@@ -137,7 +146,7 @@ def scan(
             "%s: frame numbers this large leave float32 times few digits; renumber the take",
             footage.sequence.pattern,
         )
-    times, raised = _times(crossings, noise, trembling, region, numbers, run.jobs)
+    times, raised = _times(crossings, noise, remaining, region, numbers, run.jobs)
     # The encoder wants the room.
     del crossings
     for before in np.flatnonzero(_holes(numbers)):
@@ -166,7 +175,7 @@ def scan(
                 "trembling": round(trembling, 3),
                 "off_lines": round(float(off.mean()), 4) if off.size else 0.0,
             }
-            _advise(figures, footage.sequence.pattern)
+            _advise(figures, footage)
             write_scan(output, Pass(times, lines), footage.header, provenance, encoded())
             drawn()
     write_manifest(output, recipe, mark, figures)
@@ -191,6 +200,7 @@ class _Reading(NamedTuple):
         gains: of the frames that could be read.
         not_finite: how many pixels of frames are NaN or infinite.
         first: the first frame, if it could be read, to be looked at.
+        sampled: the frames that noise and trembling were measured in.
     """
 
     crossings: Crossings
@@ -200,6 +210,7 @@ class _Reading(NamedTuple):
     gains: dict[Frame, float]
     not_finite: dict[str, int]
     first: UInt8 | None
+    sampled: list[Frame]
 
 
 class _Seen(NamedTuple):
@@ -227,7 +238,10 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
         if position == 0:
             picture = np.stack([display(plane) for plane in colours], axis=-1)
         gray = luminance_halfs(*colours)
+        place = footage.off(gray)
+        gray = displaced(gray, place)
         if position in samples.values():
+            colours = tuple(displaced(plane, place) for plane in colours)
             sample = np.stack([thin(plane) for plane in colours], axis=-1), strips(gray)
         return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
 
@@ -236,6 +250,7 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
     thinned: dict[int, Float32] = {}
     rows: list[Float32] = []
     first: UInt8 | None = None
+    sampled = []
     run.progress(0, len(frames))
     for position, item in enumerate(ordered_map(read, range(len(frames)), run.jobs)):
         if item is not None:
@@ -248,6 +263,7 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
             if sample is not None:
                 level = without_gain(sample[0], own)
                 rows.append(sample[1])
+                sampled.append(frames[position])
                 thinned |= {n: level for n, where in samples.items() if where == position}
         run.progress(position + 1, len(frames))
     if len(gains) < 3:
@@ -262,7 +278,7 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
     crossings = significant(found, noise)
     if crossings.lost.mean() > _LOST:
         crossings = _looked_at_again(footage, crossings, gains, run)
-    return _Reading(crossings, noise, trembling, marks, gains, bad, first)
+    return _Reading(crossings, noise, trembling, marks, gains, bad, first, sampled)
 
 
 def _looked_at_again(
@@ -272,7 +288,8 @@ def _looked_at_again(
     look = SecondLook(crossings, crossings.lost)
 
     def read(frame: Frame) -> Float16:
-        return luminance_halfs(*footage.image(frame, apart=True).colours(footage.transfer))
+        gray = luminance_halfs(*footage.image(frame, apart=True).colours(footage.transfer))
+        return displaced(gray, footage.off(gray))
 
     for done, (gray, own) in enumerate(
         zip(ordered_map(read, gains, run.jobs), gains.values(), strict=True), start=1
@@ -368,8 +385,9 @@ def _lines(
     return lines
 
 
-def _advise(figures: Figures, take: str) -> None:
+def _advise(figures: Figures, footage: Footage) -> None:
     """Say what a crew should know before it leaves."""
+    take = footage.sequence.pattern
     bend, reached = figures["bend"], figures["reached"]
     if abs(bend["pixels"]) > _BENT and bend["certainty"] > _CERTAIN:
         logger.warning(
@@ -393,10 +411,12 @@ def _advise(figures: Figures, take: str) -> None:
         )
     if figures["trembling"] > UNSTEADY:
         logger.warning(
-            "%s: the camera trembles by %.2f pixels, and objects are less well known; hold it"
-            " firmly, or stabilize the take",
+            "%s: the camera trembles by %.2f pixels; %s",
             take,
             figures["trembling"],
+            "objects are less well known"
+            if footage.vantage is None
+            else "frames are moved to one place",
         )
     if figures["off_lines"] > _MANY_OFF:
         logger.warning(

@@ -2,7 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from shadowtool.core.camera_motion import prepare, shift, strips, tremble
+from shadowtool.core.camera_motion import Vantage, displaced, prepare, shift
+from tests.scene import waves
 
 
 def ground(seed: int = 0, size: tuple[int, int] = (240, 320)) -> np.ndarray:
@@ -57,48 +58,65 @@ def test_grain_that_shows_one_direction_only_is_no_movement() -> None:
     assert max(value for value in found if value is not None) < 0.3
 
 
-def waves(x: float, y: float) -> np.ndarray:
-    """A texture that can be moved by any part of a pixel, (240, 320)."""
-    rng = np.random.default_rng(4)
-    rows, columns = np.mgrid[:240, :320]
-    total = np.zeros((240, 320))
-    for _ in range(40):
-        a, b, phase = rng.uniform(-0.8, 0.8), rng.uniform(-0.8, 0.8), rng.uniform(0, 7)
-        total += np.sin(a * (columns - x) + b * (rows - y) + phase)
-    return 0.5 * np.exp(0.05 * total)
+def colours(gray: np.ndarray) -> np.ndarray:
+    return (gray[..., None] * np.float32([1.0, 0.8, 0.6])).astype(np.float32)
 
 
-def trembling(
-    amount: float, noise: float = 0.003, frames: int = 16, brighter: float = 0.0
-) -> tuple[list[np.ndarray], float]:
-    """A camera that trembles while a board's shadow crosses, and by how much it did."""
-    rng = np.random.default_rng(2)
-    places = rng.normal(scale=amount, size=(frames, 2)) if amount else np.zeros((frames, 2))
-    shots = []
-    for number, (x, y) in enumerate(places):
-        shot = waves(x, y)
-        shot[:, 18 * number : 18 * number + 50] *= 0.3
-        shot *= 1 + brighter * number
-        shots.append((shot + rng.normal(scale=noise, size=shot.shape)).astype(np.float16))
-    return shots, float(np.sqrt(np.var(places, axis=0).mean()))
+@pytest.mark.parametrize("x, y", [(0.05, 0.0), (-0.1, 0.3), (0.7, -0.5), (4.0, 2.5)])
+def test_a_place_is_found_past_what_moves_and_past_noise(x: float, y: float) -> None:
+    shot = waves(x, y)
+    shot[60:200, 100:220] *= 0.3
+    shot += np.random.default_rng(0).normal(scale=0.005, size=shot.shape)
+    for image in (shot.astype(np.float32), colours(shot)):
+        assert Vantage.of(waves(0, 0)).off(image) == pytest.approx((x, y), abs=0.02)
 
 
-@pytest.mark.parametrize("amount", [0.05, 0.1, 0.3])
-@pytest.mark.parametrize("brighter", [0.0, 0.01])
-def test_a_trembling_camera_is_measured_past_what_moves(amount: float, brighter: float) -> None:
-    shots, true = trembling(amount, brighter=brighter)
-    assert tremble([strips(shot) for shot in shots]) == pytest.approx(true, rel=0.15)
+def test_frames_that_are_in_place_are_left_alone() -> None:
+    rng = np.random.default_rng(1)
+    image = colours(waves(0, 0)).astype(np.float16)
+    noisy = (image + rng.normal(scale=0.003, size=image.shape)).astype(np.float16)
+    for other in (image, noisy, image[::-1], np.full_like(image, 0.5), image * np.float16(np.nan)):
+        assert Vantage.of(image).off(other) == (0.0, 0.0)
+    assert displaced(image, (0.0, 0.0)) is image
 
 
-@pytest.mark.parametrize("noise", [0.0005, 0.003, 0.02])
-def test_a_camera_that_stands_still_does_not_tremble(noise: float) -> None:
-    shots, _ = trembling(0.0, noise)
-    assert tremble([strips(shot) for shot in shots]) < 0.01
+def test_a_vantage_amid_places_is_where_most_of_them_are() -> None:
+    places = [(0.1, 0.0), (0.3, -0.2), (0.2, -0.1)]
+    amid = Vantage.of(waves(0, 0)).amid(places)
+    assert amid.off(waves(0.2, -0.1)) == (0.0, 0.0)
+    assert amid.off(waves(0, 0)) == pytest.approx((-0.2, 0.1), abs=0.02)
+    assert amid.amid([]) == amid
 
 
-def test_where_nothing_tells_the_camera_stands_still() -> None:
-    flat = np.full((30, 40), 0.5, np.float16)
-    unknown = np.full((30, 40), np.nan, np.float16)
-    small = flat[:1, :2]
-    for shots in ([], [flat], [flat, flat], [unknown, flat], [unknown, unknown], [small, small]):
-        assert tremble([strips(shot) for shot in shots]) < 1e-3
+@pytest.mark.parametrize("x, y", [(0.1, -0.3), (0.5, 0.5), (-1.4, 0.0)])
+def test_a_frame_is_seen_as_from_elsewhere(x: float, y: float) -> None:
+    inner = slice(8, -8), slice(8, -8)
+    for there, here in ((waves(x, y), waves(0, 0)), (colours(waves(x, y)), colours(waves(0, 0)))):
+        seen = displaced(there.astype(np.float32), (x, y))
+        assert np.abs(seen - here)[inner].max() < 0.05 * np.abs(there - here)[inner].max()
+
+
+def test_rows_at_a_time_are_the_same_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = colours(waves(0, 0)).astype(np.float16)
+    image[100, 50] = np.nan
+    some = displaced(image, (0.3, -0.7))
+    monkeypatch.setattr("shadowtool.core.camera_motion._ROWS", 1000)
+    np.testing.assert_array_equal(displaced(image, (0.3, -0.7)), some)
+
+
+def test_what_is_not_finite_stays_where_it_is() -> None:
+    image = colours(waves(0, 0))
+    image[120, 160, 1], image[40, 30] = np.nan, np.inf
+    seen = displaced(image, (0.4, 0.2))
+    assert np.array_equal(~np.isfinite(seen), ~np.isfinite(image))
+    whole = displaced(np.nan_to_num(image, nan=0.5, posinf=0.5), (0.4, 0.2))
+    changed = (seen != whole).any(axis=-1)
+    rows, columns = np.nonzero(changed)
+    assert rows.min() >= 36 and columns.min() >= 26 and changed.sum() <= 2 * 81
+
+
+def test_a_highlight_leaves_no_dark_ring() -> None:
+    image = np.full((40, 40, 3), 0.2, np.float32)
+    image[20, 20] = 100.0
+    seen = displaced(image, (0.3, 0.3))
+    assert seen.min() >= 0.1 and seen.max() > 50

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from shadowtool.core import beta, camera_motion, compositing, exposure, filling, half_keys, noise
+from shadowtool.core import (
+    beta,
+    camera_motion,
+    compositing,
+    exposure,
+    filling,
+    half_keys,
+    noise,
+    trembling,
+)
 from shadowtool.core.half_floats import all_finite, to_float, to_half
 from shadowtool.core.holdout import grid_step
 from shadowtool.core.plates import ExtremePlates, Plates
@@ -311,9 +320,28 @@ CONTRACTS = {
         lambda r, a, gain: r.dtype == a.dtype and np.array_equal(np.isnan(r), np.isnan(a)),
     ),
     "tremble": Contract(
-        lambda *frames: camera_motion.tremble([camera_motion.strips(f) for f in frames]),
+        lambda *frames: trembling.tremble([trembling.strips(f) for f in frames]),
         lambda h, w: st.tuples(*(plane(h, w) for _ in range(3))),
         lambda r, *frames: isinstance(r, float) and r >= 0 and np.isfinite(r),
+    ),
+    "off_place": Contract(
+        lambda a, b: trembling.off_place(trembling.strips(a), [trembling.strips(b)]),
+        lambda h, w: st.tuples(plane(h, w), plane(h, w)),
+        lambda r, a, b: isinstance(r, float) and r >= 0 and np.isfinite(r),
+    ),
+    "Vantage.off": Contract(
+        lambda a, b: camera_motion.Vantage.of(a).off(b),
+        lambda h, w: st.tuples(picture(h, w), picture(h, w)),
+        lambda r, a, b: bool(np.isfinite(r).all()),
+    ),
+    "displaced": Contract(
+        camera_motion.displaced,
+        lambda h, w: st.tuples(halfs(h, w), st.tuples(st.floats(-2, 2), st.floats(-2, 2))),
+        lambda r, image, place: (
+            r.dtype == image.dtype
+            and r.shape == image.shape
+            and np.array_equal(np.isfinite(r), np.isfinite(image))
+        ),
     ),
     "resized": Contract(
         resized,

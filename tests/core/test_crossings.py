@@ -58,7 +58,7 @@ def test_one_reading_finds_what_two_find(
     found = finder.found()
     at, before, after = crossings_in_two_readings(grays)
     with np.errstate(invalid="ignore"):
-        seen = found.highest - found.lowest > LEAST_CONTRAST * found.highest
+        seen = found.highest - found.lowest > LEAST_CONTRAST * np.abs(found.highest)
     known = ~found.lost & seen
     assert np.array_equal(found.at[known], at[known])
     told = known & (at > 0)

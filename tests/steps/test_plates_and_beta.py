@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from shadowtool.choices import Estimator
+from shadowtool.choices import Estimator, Steady
 from shadowtool.core.beta import inverse_span, shadow_matte
 from shadowtool.core.plates import ExtremePlates, Plates
 from shadowtool.errors import InputError
@@ -20,7 +20,7 @@ from shadowtool.steps.composite import composite
 from shadowtool.steps.matte import matte
 from shadowtool.steps.plate import plate
 from shadowtool.steps.run import Run
-from tests.scene import Scene, smoothstep
+from tests.scene import Scene, smoothstep, waves
 
 HEIGHT, WIDTH, FRAMES, FIRST = 54, 96, 30, 1001
 SCENE = Scene(HEIGHT, WIDTH, rows=(0, 0), columns=(0, 0))
@@ -228,21 +228,75 @@ def test_a_take_without_shadow_is_told_of(
     assert "β is unknown in 100% of the picture" in caplog.text
 
 
+def passing_beta(number: int, x: float = 0.0) -> np.ndarray:
+    """β of a shadow that crosses the ground of `waves`, from a camera's place."""
+    off = np.abs(np.arange(320) - x - 20 * number - 10) - 30
+    return np.tile(np.clip(off / 8 + 0.5, 0, 1), (240, 1))
+
+
+def trembling_take(folder: Path, amount: float) -> tuple[Path, np.ndarray]:
+    """A shadow that crosses textured ground before a camera that trembles, and its places."""
+    places = np.random.default_rng(0).normal(0, amount, (16, 2))
+    places -= np.median(places, axis=0)
+    colour = np.float32([1, 0.8, 0.6])
+    shots = [
+        (waves(x, y) * (0.3 + 0.7 * passing_beta(number, x)))[..., None] * colour
+        for number, (x, y) in enumerate(places)
+    ]
+    return write_frames(folder / "take", (shot.astype(np.float16) for shot in shots)), places
+
+
 @pytest.mark.parametrize("amount", [0.0, 0.2])
-def test_a_camera_that_trembles_is_told_of(
+def test_a_camera_that_trembles_is_told_of_and_taken_out(
     amount: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    rng = np.random.default_rng(0)
-    shots = []
-    for number in NUMBERS:
-        move = np.float32([[1, 0, rng.normal(0, amount)], [0, 1, rng.normal(0, amount)]])
-        image = picture(number).astype(np.float32)
-        moved = cv2.warpAffine(image, move, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REPLICATE)
-        shots.append(moved.astype(np.float16))
-    frames = write_frames(tmp_path / "take", shots)
-    figures = plate(frames, tmp_path / "plates").figures
-    assert (figures["trembling"] > 0.05) == (amount > 0)
-    assert ("the camera trembles" in caplog.text) == (amount > 0)
+    take, _ = trembling_take(tmp_path, amount)
+    off, moved = dict[str, float](), dict[str, float]()
+    choices: tuple[Steady, ...] = ("auto", "none")
+    for steady in choices:
+        caplog.clear()
+        plates, out = tmp_path / f"{steady}-plates", tmp_path / steady
+        figures = plate(take, plates, holdout="none", steady=steady).figures
+        assert figures["trembling"] == pytest.approx(amount, rel=0.4, abs=0.01)
+        assert ("the camera trembles" in caplog.text) == (amount > 0)
+        figures = matte(take, out, plates=plates, only="beta", steady=steady).figures
+        assert ("frames are moved there" in caplog.text) == (amount > 0 and steady == "auto")
+        moved[steady] = figures["moved"]
+        betas = (beta_of(out, FIRST + n) - passing_beta(n) for n in range(16))
+        off[steady] = float(np.mean([np.abs(beta)[4:-4, 4:-4].mean() for beta in betas]))
+    assert moved["none"] == 0
+    if amount:
+        assert moved["auto"] > 0.2 and off["auto"] < 0.1 * off["none"]
+    else:
+        assert moved["auto"] == 0 and off["auto"] == off["none"]
+
+
+def test_a_matte_that_is_given_is_moved_with_its_frame(tmp_path: Path) -> None:
+    take, places = trembling_take(tmp_path, 0.2)
+    columns = np.arange(320.0)
+
+    def post(x: float) -> np.ndarray:
+        return np.tile(np.clip(10.5 - np.abs(columns - x - 160), 0, 1), (240, 1))
+
+    roto = write_mattes(tmp_path / "roto", (post(x) for x, _ in places))
+    plate(take, tmp_path / "plates", holdout="none")
+    matte(take, tmp_path / "matte", plates=tmp_path / "plates", alpha=roto)
+    off = []
+    for n, (x, _) in enumerate(places):
+        alpha = read_image(tmp_path / f"matte/fg/fg.{FIRST + n}.exr").channel("A")
+        off.append([np.abs(alpha - post(place)).max() for place in (0, x)])
+    still, trembling = np.mean(off, axis=0)
+    assert still < 0.5 * trembling
+
+
+def test_a_moved_frame_is_the_same_in_any_chunk(tmp_path: Path) -> None:
+    take, _ = trembling_take(tmp_path, 0.2)
+    plate(take, tmp_path / "plates")
+    matte(take, tmp_path / "whole", plates=tmp_path / "plates", only="beta")
+    some = Run(frames="1004,1009", jobs=1)
+    matte(take, tmp_path / "some", plates=tmp_path / "plates", only="beta", run=some)
+    for number in (1004, 1009):
+        assert np.array_equal(*(beta_of(tmp_path / n, number) for n in ("whole", "some")))
 
 
 def test_sampled_frames_are_read_once_as_far_as_they_are_kept(

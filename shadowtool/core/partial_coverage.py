@@ -55,13 +55,22 @@ def shadow_ratio_field(
         (H, W, 3) float32 and the spread of log ratios; None if nothing was shaded in full.
     """
     gray = _log_ratio(channel_sum(lit), channel_sum(shadow))
-    return _ratio_field(lit, shadow, gray, _level(gray, frames), plane)
+    return _ratio_field(lit, shadow, gray, _level(gray, _usual(gray), frames), plane)
 
 
-def _level(gray: Float32, frames: NDArray[np.uint32], least: int = _FIRM) -> Bool:
+def _level(gray: Float32, usual: Float32, frames: NDArray[np.uint32], least: int = _FIRM) -> Bool:
     """Where a shadow fell in so many frames and log(S/L) is level: what climbs is a penumbra,
-    however long it stood there."""
-    return (frames >= least) & np.isfinite(gray) & (_slope(gray) < _SLOPE)
+    however long it stood there.
+
+    Args:
+        usual: of `_usual`.
+    """
+    return (frames >= least) & np.isfinite(gray) & (_slope(usual) < _SLOPE)
+
+
+def _usual(gray: Float32) -> Float32:
+    """The log ratio that most of the pixels around have; unknown ones count as 0, no shadow."""
+    return np.asarray(cv2.medianBlur(np.nan_to_num(gray), 5), np.float32)
 
 
 def _ratio_field(
@@ -133,9 +142,12 @@ def complete_shadow(
     else:
         partial, region = True, plane
     gray = _log_ratio(channel_sum(lit), channel_sum(shadow))
+    usual = _usual(gray)
+    with np.errstate(invalid="ignore"):
+        alone = np.abs(gray - usual) > _COMMON
     # In a take of few frames no shadow stays for several.
     for least in (_FIRM, 1):
-        level = _level(gray, frames, least)
+        level = _level(gray, usual, frames, least)
         if (found := _ratio_field(lit, shadow, gray, level, plane)) is not None:
             break
     result = np.asarray(cv2.copyTo(shadow, dark.view(np.uint8), lit.copy()), np.float32)
@@ -150,7 +162,7 @@ def complete_shadow(
     few = region & dark & darker
     own[few] = np.minimum(frames[few] / np.float32(_FIRM), 1)
     # On the plane only what is level over some area can be a surface of its own.
-    own[region & ~(darker | alike | _opened(level))] = 0
+    own[region & ~(darker | alike | (_opened(level) & ~alone))] = 0
     # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
     both = np.flatnonzero(alike & region & (own > 0))
     for start in range(0, both.size, _BLOCK):
@@ -181,10 +193,8 @@ def _log_ratio(lit: Float32, shadow: Float32) -> Float32:
 
 
 def _slope(gray: Float32) -> Float32:
-    """Length of the gradient of a smoothed log ratio, per pixel; unknown pixels count as 0,
-    which is no shadow at all."""
-    smooth = cv2.medianBlur(np.nan_to_num(gray), 5)
-    smooth = cv2.GaussianBlur(smooth, (0, 0), 1.5, dst=smooth)
+    """Length of the gradient of a log ratio without noise, per pixel."""
+    smooth = cv2.GaussianBlur(gray, (0, 0), 1.5)
     x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
     y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
     return np.asarray(cv2.magnitude(x, y, magnitude=x), np.float32)

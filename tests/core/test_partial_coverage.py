@@ -142,6 +142,16 @@ def carded() -> Take:
     return crossed(surfaces(), own_shade.astype(float))
 
 
+def test_specks_of_something_else_in_the_shadow_are_no_surface() -> None:
+    take = crossed(RATIO, band())
+    specks = np.zeros((HEIGHT, WIDTH), bool)
+    specks[45, 20:140:17] = specks[40, 33:36] = True
+    take.measured[specks] = 0.7 * take.lit[specks]
+    completed = take.completed()
+    assert (completed.own[specks] == 0).all()
+    assert take.error(completed.shadow)[specks].max() < 0.15
+
+
 def test_under_a_card_the_shadow_is_left_as_measured() -> None:
     take = carded()
     found = take.completed()

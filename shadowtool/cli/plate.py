@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from shadowtool.choices import ESTIMATORS
+from shadowtool.choices import ESTIMATORS, READINGS
 from shadowtool.cli.options import gain_option, steady_option, step_command, transfer_option
 
 
@@ -33,6 +33,16 @@ from shadowtool.cli.options import gain_option, steady_option, step_command, tra
     metavar="IMAGE|POLYGON",
     help="The plane that the shadow falls on, as for scan. Default: all of the picture if the"
     " shadow reached less than most of it.",
+)
+@click.option(
+    "--read-as",
+    type=click.Choice(READINGS),
+    default="auto",
+    show_default=True,
+    help="plane: a shadow crossed a plane, as in a source, and what it didn't reach would be as"
+    " dark as the rest. card: a card was waved over a scene, as in a target, and what never got"
+    " darker is in shade already. auto: by how much got dark, altogether and at once, and whether"
+    " anybody is seen.",
 )
 @gain_option
 @steady_option

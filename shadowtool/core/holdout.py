@@ -6,6 +6,7 @@ grid: L is the value on whose line most of a pixel's samples lie, S is L times t
 scene's shadows have in common.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -37,8 +38,13 @@ _TELLING = 20
 # Ratios of shadow scatter by no more than noise and this part; and noise that widens a peak lowers
 # it by so much at most.
 _SCATTER, _LOWERED = 0.03, 2.0
-# A take whose shadow darkens more of the picture than this is that of a card waved over a scene.
-_MOST, _SHADED, _AT_ONCE = 0.5, 0.5, 0.2
+# Less than this part of its light is darkened. A take in which a shadow darkens more of the picture
+# than the next, and so much at once, is that of a card waved over a scene.
+_SHADED, _MOST, _AT_ONCE = 0.5, 0.5, 0.2
+# So is one in which it darkens as much of both as this, a geometric mean, and nobody is seen: 0.1
+# at most is usual of somebody's shadow, and 0.2 and more of a card's. Somebody is brighter than lit
+# ground, by this part, in more than the last part of the picture.
+_LARGE, _BRIGHTER, _SOMEBODY = 0.14, 0.1, 0.002
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
 # Decided pixels are dropped when no more than this part is left.
@@ -69,22 +75,22 @@ class Background:
     Attributes:
         lit, shadow: (h, w, 3) float32.
         noise: the take's.
+        under_card: whether a shadow came over most of the picture: that is a card waved over a
+            scene whose surfaces have each their own S/L, for which these lines don't stand, and
+            nobody is in it.
     """
 
     lit: Float32
     shadow: Float32
     noise: NoiseModel
+    under_card: bool
 
 
-def find_background(samples: list[Float32], noise: NoiseModel) -> Background | None:
+def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     """The background's lines from a sample of the take's frames on the grid.
 
     Args:
         samples: frames spread over the take, each (h, w, 3).
-
-    Returns:
-        None for a take in which a shadow comes over most of the picture: that is a card waved over
-        a scene whose surfaces have each their own S/L, and nobody is in it.
     """
     shape = samples[0].shape
     stack = np.stack([channels(sample) for sample in samples])
@@ -95,11 +101,10 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background | N
     lit = _most_supported(stack, ascending, weighed, ratio)
     shadow = lit * ratio
     on_line = [_on_line(sample, lit, shadow) for sample in weighed]
-    if _under_a_card(stack, on_line, lit):
-        return None
+    under_card = _under_a_card(stack, on_line, lit)
     shadow = _deeper_shade(stack, on_line, lit, shadow, shape[:2])
     lit, shadow = (np.ascontiguousarray(plate.T).reshape(shape) for plate in (lit, shadow))
-    return Background(lit, shadow, noise)
+    return Background(lit, shadow, noise, under_card)
 
 
 def figure_mask(image: Float32, background: Background) -> Bool:
@@ -255,22 +260,26 @@ def _mean_where(stack: Float32, chosen: list[Bool]) -> tuple[Float32, Float32]:
 
 
 def _under_a_card(stack: Float32, on_line: list[Bool], lit: Float32) -> bool:
-    """Whether a shadow came over most of the picture, twice at least.
+    """Whether a shadow came over much of the picture, twice at least, and over much of it at once.
 
-    It is known by the common ratio, or by darkening much of the picture at once, which dark clothes
-    do not.
+    What is dark may be clothes, and is shadow for certain where the common ratio says so, but not
+    all of a scene has the same: both count. Whoever casts a shadow in a source is seen in it, and
+    hardly anybody is nowhere brighter than the ground.
     """
-    dark = np.zeros(lit.shape[1], np.int32)
-    shaded = np.zeros_like(dark)
-    widest = 0.0
-    for sample, lies in zip(stack, on_line, strict=True):
+    dark, shaded = (np.zeros(lit.shape[1], np.int32) for _ in range(2))
+    at_once, brighter = np.zeros((len(stack), 2)), 0.0
+    for sample, lies, parts in zip(stack, on_line, at_once, strict=True):
         now = sample.sum(axis=0) < _SHADED * lit.sum(axis=0)
         dark += now
         shaded += now & lies
-        widest = max(widest, float(now.mean()))
-    if (shaded >= 2).mean() > _MOST:
+        parts[:] = now.mean(), (now & lies).mean()
+        above = (sample > (1 + _BRIGHTER) * lit + _TOLERANCE).any(axis=0)
+        brighter += float((above & ~lies).mean()) / len(stack)
+    altogether = [float((often >= 2).mean()) for often in (dark, shaded)]
+    widest = at_once.max(axis=0)
+    if altogether[1] > _MOST or (altogether[0] > _MOST and widest[0] > _AT_ONCE):
         return True
-    return bool((dark >= 2).mean() > _MOST and widest > _AT_ONCE)
+    return math.prod((*altogether, *widest)) > _LARGE**4 and brighter < _SOMEBODY
 
 
 def _deeper_shade(

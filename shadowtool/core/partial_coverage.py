@@ -117,6 +117,7 @@ def complete_shadow(
     frames: NDArray[np.uint32],
     noise: NoiseModel,
     plane: Bool | None = None,
+    card: bool | None = None,
 ) -> Completed:
     """The shadow plate with S/L of the plane where the shadow itself says too little.
 
@@ -131,13 +132,14 @@ def complete_shadow(
         noise: the noise of one frame.
         plane: (H, W) the region of the plane, if it is known: the second reading holds there, the
             first elsewhere.
+        card: which of the two holds for all of it otherwise; None if nobody knows.
     """
     seen, dark = np.isfinite(channel_sum(lit)), np.isfinite(channel_sum(shadow))
     if plane is None:
         pixels = max(int(seen.sum()), 1)
         firm, some = (((frames >= least) & seen).sum() / pixels for least in (_FIRM, 1))
         # A card that goes by quickly shades no pixel often, but all.
-        partial = bool(firm < _MOST and some < _NEARLY_ALL)
+        partial = bool(firm < _MOST and some < _NEARLY_ALL) if card is None else not card
         region = np.full(dark.shape, partial)
     else:
         partial, region = True, plane

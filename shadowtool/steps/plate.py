@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.choices import Estimator, Gain, Missing, Steady
+from shadowtool.choices import Estimator, Gain, Missing, Reading, Steady
 from shadowtool.core.beta import shadow_contrast
 from shadowtool.core.exposure import common_reference, frame_gain, without_gain
 from shadowtool.core.half_floats import not_finite, shortened
@@ -87,6 +87,7 @@ def plate(
     holdout: str | Path = "auto",
     estimator: Estimator = "robust",
     plane: str | None = None,
+    read_as: Reading = "auto",
     gain: Gain = "auto",
     steady: Steady = "auto",
     transfer: str = "auto",
@@ -102,12 +103,14 @@ def plate(
         gain: find each frame's exposure and take it out, or take frames as they are. Always as
             they are with ``minmax``.
         plane: mask image or polygon of the plane that the shadow falls on, for ``robust``.
+        read_as: whether a shadow crossed a plane or a card was waved over a scene, for ``robust``.
         steady: of a camera that trembles, move frames to one place, or take them as they are.
             Always as they are with ``minmax``.
 
     Raises:
         InputError: frames, holdout or mask are missing or don't fit.
-        OptionError: a plane for ``minmax``, or a polygon that can't be read.
+        OptionError: a plane or a reading for ``minmax``, both of them, or a polygon that can't be
+            read.
         DamagedFileError: a frame can't be read.
     """
     footage = open_footage(source, "frames", transfer, run.missing)
@@ -121,6 +124,10 @@ def plate(
     )
     if plane is not None and estimator == "minmax":
         raise OptionError("--plane is for --estimator robust; Eq. (4) knows no plane")
+    if read_as != "auto" and (plane is not None or estimator == "minmax"):
+        raise OptionError(
+            "--read-as goes neither with --plane, which says it already, nor with minmax"
+        )
     marked = None if plane is None else read_plane(plane, footage.header)
 
     written = [_place(output / HOLDOUT_FOLDER, frame) for frame in frames] if automatic else []
@@ -137,6 +144,7 @@ def plate(
         shared = [marked.mark]
     parameters = {
         "estimator": estimator,
+        "read_as": read_as,
         "transfer": footage.transfer,
         "gain": gain if estimator == "robust" else "none",
         "steady": steady if estimator == "robust" else "none",
@@ -168,6 +176,7 @@ def plate(
         held,
         parameters["gain"] == "auto",
         parameters["steady"] == "auto",
+        {"card": True, "plane": False}.get(read_as),
         output / HOLDOUT_FOLDER,
         recipe.provenance(recipe.fingerprint([])),
     )
@@ -289,6 +298,7 @@ class _Take:
         background: what the automatic one goes by, once it is known; None for none.
         level: whether changes of exposure are taken out.
         steady: whether frames are moved to one place if the camera trembles.
+        card: whether it is that of a card waved over a scene; None while that isn't known.
         reference: what exposure is measured against, on its grid; None until it is known.
         kept: sampled frames that need not be read again.
         known_gains: of the sampled frames.
@@ -304,6 +314,7 @@ class _Take:
     held: Sequence | None
     level: bool
     steady: bool
+    card: bool | None
     folder: Path
     provenance: dict[str, str]
     background: Background | None = None
@@ -471,9 +482,13 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         take.reference = common_reference([take.sparse(grids[frame]) for frame in apart])
     gains = {frame: take.gain(frame, grid) for frame, grid in grids.items()}
     take.known_gains = gains
-    if automatic and apart:
+    if apart and (automatic or (with_levels and take.card is None)):
         level = [grids[frame] / np.float32(gains[frame]) for frame in apart]
-        take.background = find_background(level, noise)
+        background = find_background(level, noise)
+        if take.card is None and background.under_card:
+            take.card = True
+        if automatic and not take.card:
+            take.background = background
     if take.background is not None:
         make_folder(take.folder)
     levels = SampledLevels(height, width)
@@ -532,7 +547,9 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
     lit = shortened(found.lit)
 
     def complete() -> tuple[Plates, Figures]:
-        completed = complete_shadow(lit, found.shadow, found.shadow_frames, noise, region)
+        completed = complete_shadow(
+            lit, found.shadow, found.shadow_frames, noise, region, take.card
+        )
         shadow = shortened(completed.shadow)
         plates = Plates(lit, shadow, found.lit_frames, found.shadow_frames)
         seen = found.lit_frames > 0

@@ -13,7 +13,7 @@ import pytest
 from shadowtool.choices import Estimator, Steady
 from shadowtool.core.beta import inverse_span, shadow_matte
 from shadowtool.core.plates import ExtremePlates, Plates
-from shadowtool.errors import InputError
+from shadowtool.errors import InputError, OptionError
 from shadowtool.io.image import Header, Image, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, read_plates
 from shadowtool.steps.composite import composite
@@ -88,7 +88,7 @@ def walk_plates(takes: Path) -> Path:
 def level_plates(takes: Path) -> Path:
     """The plates of the takes without and with a dip in exposure; nobody writes here."""
     for name in ("plain", "dip"):
-        plate(takes / name, takes / "level" / name, holdout="none")
+        plate(takes / name, takes / "level" / name, holdout="none", read_as="plane")
     return takes / "level"
 
 
@@ -145,7 +145,7 @@ def test_what_was_held_out_can_be_given_back(
 def test_a_take_without_a_figure_holds_nothing_out(
     takes: Path, level_plates: Path, tmp_path: Path
 ) -> None:
-    plate(takes / "plain", tmp_path / "auto")
+    plate(takes / "plain", tmp_path / "auto", read_as="plane")
     assert not np.any(held_out(tmp_path / "auto"))
     auto, none = plates_of(tmp_path / "auto"), plates_of(level_plates / "plain")
     assert np.array_equal(auto.lit, none.lit) and np.array_equal(auto.shadow, none.shadow)
@@ -198,7 +198,7 @@ def test_what_is_kept_in_memory_changes_no_bit(
     monkeypatch.setattr("shadowtool.steps.plate._KEPT", budget)
     plate(takes / "walk", tmp_path / "walk")
     assert tree(tmp_path / "walk") == tree(walk_plates)
-    plate(takes / "dip", tmp_path / "dip", holdout="none")
+    plate(takes / "dip", tmp_path / "dip", holdout="none", read_as="plane")
     assert tree(tmp_path / "dip") == tree(level_plates / "dip")
 
 
@@ -357,7 +357,7 @@ def test_gains_are_recorded(takes: Path, level_plates: Path, tmp_path: Path) -> 
 
 
 def test_a_steady_take_has_no_gains(takes: Path, level_plates: Path, tmp_path: Path) -> None:
-    plate(takes / "plain", tmp_path / "none", holdout="none", gain="none")
+    plate(takes / "plain", tmp_path / "none", holdout="none", read_as="plane", gain="none")
     assert figures_of(level_plates / "plain")["gains"] == {}
     one, other = plates_of(level_plates / "plain"), plates_of(tmp_path / "none")
     assert np.array_equal(one.lit, other.lit) and np.array_equal(one.shadow, other.shadow)
@@ -558,6 +558,40 @@ def test_a_holdout_that_someone_corrected_is_not_replaced_unasked(
     assert corrected.read_bytes() == before
     plate(takes / "walk", tmp_path / "again", holdout=tmp_path / "roto")
     assert plates_of(tmp_path / "again").frames.max() <= FRAMES - 1
+
+
+@pytest.mark.parametrize("holdout", ["auto", "none"])
+def test_a_scene_half_of_which_no_card_darkens_keeps_its_own_shade(
+    holdout: str, tmp_path: Path
+) -> None:
+    """There is a backdrop that the light never reaches, and on the ground a wall's shade."""
+    rng = np.random.default_rng(2)
+    lit = rng.uniform(0.2, 0.8, (80, 120, 3))
+    shade = np.ones((80, 120, 1))
+    shade[:36], shade[50:, 80:] = 0.9, 0.25
+    frames = []
+    for right in np.linspace(0, 160, 40):
+        x = np.arange(120)
+        beta = 1 - ((x < right) & (x >= right - 30))[np.newaxis, :, np.newaxis]
+        light = np.where(shade < 1, shade, 0.25 + 0.75 * beta)
+        frames.append((lit * light + 0.003 * rng.normal(size=lit.shape)).astype(np.float32))
+    take = write_frames(tmp_path / "take", frames)
+    result = plate(take, tmp_path / "plates", holdout=holdout)
+    assert result.figures["read_as"] == "a scene under a card"
+    assert result.figures["held_out"] == "nothing"
+    assert (
+        error(plates_of(tmp_path / "plates").shadow[50:, 80:], lit[50:, 80:] * 0.25).mean() < 0.05
+    )
+    result = plate(take, tmp_path / "plane", holdout=holdout, read_as="plane")
+    assert result.figures["read_as"] == "a plane that a shadow crossed"
+    assert plates_of(tmp_path / "plane").shadow[50:, 80:].mean() < 0.1 * lit.mean()
+
+
+def test_a_reading_is_for_means_and_for_takes_without_a_plane(takes: Path, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="--read-as"):
+        plate(takes / "walk", tmp_path / "out", read_as="card", estimator="minmax")
+    with pytest.raises(OptionError, match="--read-as"):
+        plate(takes / "walk", tmp_path / "out", read_as="card", plane="0,0 9,0 9,9")
 
 
 def test_a_card_that_stops_half_way_is_told_of(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
-from shadowtool.core.shadow_lines import interpolate_lines
+from shadowtool.core.shadow_lines import interpolate_lines, line_pace
 from shadowtool.core.warp_map import Pass
 
 Float32 = NDArray[np.float32]
@@ -26,14 +26,13 @@ _AGREE = 4.0
 
 
 def measure_parallax(
-    passes: list[Pass], positions: Float32, directions: Float32, speeds: list[Float64]
+    passes: list[Pass], positions: Float32, directions: Float32
 ) -> tuple[Float32, Float32]:
     """What the passes' own times tell of s, pixel by pixel.
 
     Args:
         passes: two or more, all of the size of ``positions``.
         positions, directions: (H, W, 2), p and u.
-        speeds: for each pass the speed of each of its lines, pixels a frame (`line_speed`).
 
     Returns:
         s and its standard deviation, pixels, (H, W) float32 each; NaN and infinite where fewer than
@@ -43,17 +42,15 @@ def measure_parallax(
     shift, deviation = np.empty(shape, np.float32), np.empty(shape, np.float32)
     for rows in bands(shape):
         own = [scan.part(rows) for scan in passes]
-        part = _measured(own, positions[rows], directions[rows], speeds)
+        part = _measured(own, positions[rows], directions[rows])
         shift[rows], deviation[rows] = part
     return shift, deviation
 
 
 def _measured(
-    passes: list[Pass], positions: Float32, directions: Float32, speeds: list[Float64]
+    passes: list[Pass], positions: Float32, directions: Float32
 ) -> tuple[Float32, Float32]:
-    measured = [
-        _one(scan, positions, directions, speed) for scan, speed in zip(passes, speeds, strict=True)
-    ]
+    measured = [_one(scan, positions, directions) for scan in passes]
     shift = np.stack([m[0] for m in measured])
     weight = np.stack([m[1] for m in measured])
     weight = _without_outvoted(shift, weight)
@@ -72,7 +69,7 @@ def _measured(
 
 
 def _one(
-    scan: Pass, positions: Float32, directions: Float32, speed: Float64
+    scan: Pass, positions: Float32, directions: Float32
 ) -> tuple[Float64, Float64, NDArray[np.bool_]]:
     """One pass's s, the inverse of its variance, which is 0 where it measures none, and which
     pixels it reached."""
@@ -84,12 +81,14 @@ def _one(
     normal, offset = lines.normal[inside], lines.offset[inside]
     across = (normal * directions[known]).sum(axis=-1)
     distance = -(normal * positions[known]).sum(axis=-1) - offset
-    pace = np.interp(time[known], scan.lines.frame, speed)
-    variance = (error[known] * pace) ** 2 + lines.residual[inside] ** 2 + _LEAST_RESIDUAL**2
     usable = np.abs(across) > _ALONG
     across = np.where(usable, across, 1)
+    along = np.where(usable, distance / across, 0)
+    passed = positions[known] + along[:, np.newaxis] * directions[known]
+    pace = line_pace(scan.lines, lines.frame[inside], passed)
+    variance = (error[known] * pace) ** 2 + lines.residual[inside] ** 2 + _LEAST_RESIDUAL**2
     shift, weight = np.zeros(time.shape), np.zeros(time.shape)
-    shift[known] = np.where(usable, distance / across, 0)
+    shift[known] = along
     weight[known] = np.where(usable, across**2 / variance, 0)
     return shift, weight, known
 

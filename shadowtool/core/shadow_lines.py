@@ -142,23 +142,28 @@ def interpolate_lines(lines: ShadowLines, times: Float64) -> ShadowLines:
     return ShadowLines(times, normal, offset, residual, none, tuple(origin))
 
 
-def line_speed(lines: ShadowLines, shape: tuple[int, ...]) -> Float64:
-    """(F,) how fast the line moves over the picture, pixels a frame along its normal, ≥ 0.
+def line_pace(
+    lines: ShadowLines, times: NDArray[np.floating], points: NDArray[np.number]
+) -> Float64:
+    """How fast the lines pass points of the picture, pixels a frame along their normals.
 
-    Measured where the line passes nearest to the middle of a picture of ``shape`` (H, W).
+    Before a low camera lines fan out, and pass some points many times as fast as others.
+
+    Args:
+        times: (N,), frame numbers; those beyond the lines' span count as its ends.
+        points: (N, 2), (x, y), on the line of each time or next to it.
+
+    Returns:
+        (N,) float64 ≥ 0; 0 of a single line.
     """
-    middle = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
-    distance = lines.normal @ middle + lines.offset
-    foot = middle - distance[:, None] * lines.normal
     if len(lines) < 2:
-        return np.zeros(len(lines))
-    # From each line to the next, at the foot of the first.
-    step = np.abs((lines.normal[1:] * foot[:-1]).sum(axis=-1) + lines.offset[1:])
-    step /= np.diff(lines.frame)
-    speed = np.empty(len(lines))
-    speed[0], speed[-1] = step[0], step[-1]
-    speed[1:-1] = (step[:-1] + step[1:]) / 2
-    return speed
+        return np.zeros(len(times))
+    first = np.clip(np.searchsorted(lines.frame, times, side="right") - 1, 0, len(lines) - 2)
+    behind, ahead = (
+        (lines.normal[which] * points).sum(axis=-1) + lines.offset[which]
+        for which in (first, first + 1)
+    )
+    return np.asarray(np.abs(ahead - behind) / np.diff(lines.frame)[first], np.float64)
 
 
 def off_lines(time: Float32, plane: NDArray[np.bool_], lines: ShadowLines) -> Float32:
@@ -173,12 +178,18 @@ def off_lines(time: Float32, plane: NDArray[np.bool_], lines: ShadowLines) -> Fl
         (N,) float32 ≥ 0, pixels, of some of those whose time the lines span; empty if there is
         none.
     """
-    places = np.flatnonzero(plane & np.isfinite(time))
-    places = places[:: max(1, places.size // _SOME_PLACES)]
-    y, x = np.divmod(places, time.shape[1])
-    own = interpolate_lines(lines, time[y, x].astype(np.float64))
-    distance = np.abs(own.normal[:, 0] * x + own.normal[:, 1] * y + own.offset)
-    return distance[np.isfinite(distance)].astype(np.float32)
+    places = some_of(plane & np.isfinite(time))
+    own = interpolate_lines(lines, time[places].astype(np.float64))
+    distance = np.abs((own.normal * np.stack(places[::-1], axis=-1)).sum(axis=-1) + own.offset)
+    return np.asarray(distance[np.isfinite(distance)], np.float32)
+
+
+def some_of(region: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns of some places of a region, (H, W), evenly spread: enough to tell what is
+    usual there."""
+    places = np.flatnonzero(region)
+    y, x = np.divmod(places[:: max(1, places.size // _SOME_PLACES)], region.shape[1])
+    return y, x
 
 
 class Bend(NamedTuple):

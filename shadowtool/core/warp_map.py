@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
 from shadowtool.core.half_floats import to_float
-from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines
+from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines, line_pace
 from shadowtool.core.shadow_time import ShadowTimes
 
 Float32 = NDArray[np.float32]
@@ -67,7 +67,7 @@ def identity_map(height: int, width: int) -> Float32:
     return np.stack([x, y], axis=-1)
 
 
-def intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
+def intersect(passes: list[Pass], positions: Float32) -> WarpMap:
     """The weighted least squares intersection of the shadow lines through each pixel.
 
     Each pass contributes its line at t_s[p] with the weight w = c_s[p]² · exp(-E²), E the line's
@@ -75,7 +75,7 @@ def intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
 
     Args:
         passes: two or more, all of one size.
-        speeds: for each pass the speed of each of its lines, pixels a frame (`line_speed`).
+        positions: (H, W, 2), the pixels' own.
 
     Returns:
         W; unknown where fewer than two passes that differ by `LEAST_ANGLE` reached the pixel. Where
@@ -84,12 +84,12 @@ def intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
     shape = passes[0].times.time.shape
     found = WarpMap(np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
     for rows in bands(shape):
-        part = _intersect([scan.part(rows) for scan in passes], speeds)
+        part = _intersect([scan.part(rows) for scan in passes], positions[rows])
         found.warp[rows], found.error[rows] = part.warp, part.error
     return found
 
 
-def _intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
+def _intersect(passes: list[Pass], positions: Float32) -> WarpMap:
     shape = passes[0].times.time.shape
     # The normal equations Σ w nnᵀ q = -Σ w d n, and the same with each line in units of its own
     # standard deviation, whose inverse is q's covariance.
@@ -98,7 +98,7 @@ def _intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
     least_cosine = np.full(shape, np.inf)
     normals, through = [], []
     best = min(float(scan.lines.residual.min()) for scan in passes)
-    for scan, speed in zip(passes, speeds, strict=True):
+    for scan in passes:
         known = np.isfinite(scan.times.time)
         lines = interpolate_lines(scan.lines, scan.times.time[known].astype(np.float64))
         spans = np.isfinite(lines.offset)
@@ -110,7 +110,11 @@ def _intersect(passes: list[Pass], speeds: list[Float64]) -> WarpMap:
         weight = scan.times.contrast[known].astype(np.float64) ** 2 * fit
         for row, term in zip(weighted, (nx * nx, nx * ny, ny * ny, nx * d, ny * d), strict=True):
             row[known] += weight * term
-        pace = np.interp(lines.frame[spans], scan.lines.frame, speed)
+        # Where the pixel's line passes it nearest.
+        here = positions[known]
+        away = nx * here[:, 0] + ny * here[:, 1] + d
+        passed = here - away[:, np.newaxis] * lines.normal[spans]
+        pace = line_pace(scan.lines, lines.frame[spans], passed)
         spread = scan.times.error[known] * pace
         precision = 1 / (spread**2 + residual**2 + 1e-4)
         for row, term in zip(information, (nx * nx, nx * ny, ny * ny), strict=True):

@@ -22,8 +22,9 @@ from shadowtool.core.shadow_lines import (
     ShadowLines,
     fit_shadow_lines,
     line_bend,
-    line_speed,
+    line_pace,
     off_lines,
+    some_of,
     zero_crossings,
 )
 from shadowtool.core.shadow_time import (
@@ -170,7 +171,7 @@ def scan(
         with meanwhile(lambda: write_png(output / PICTURE, draw(), provenance)) as drawn:
             bend = line_bend(points, numbers, lines, footage.header.size)
             off = off_lines(times.time, region, lines) > _OFF
-            figures = _figures(times, lines, gains, bend) | {
+            figures = _figures(times, lines, region, gains, bend) | {
                 "errors_raised": round(raised, 2),
                 "trembling": round(trembling, 3),
                 "off_lines": round(float(off.mean()), 4) if off.size else 0.0,
@@ -435,9 +436,14 @@ def _advise(figures: Figures, footage: Footage) -> None:
 
 
 def _figures(
-    times: ShadowTimes, lines: ShadowLines, gains: dict[Frame, float], bend: Bend
+    times: ShadowTimes,
+    lines: ShadowLines,
+    region: NDArray[np.bool_],
+    gains: dict[Frame, float],
+    bend: Bend,
 ) -> Figures:
-    speed = line_speed(lines, times.time.shape)
+    y, x = some_of(region & np.isfinite(times.time))
+    pace = line_pace(lines, times.time[y, x], np.stack([x, y], axis=-1))
     turned = math.degrees(float(lines.angle[-1] - lines.angle[0]))
     origins = list(lines.origin)
     return {
@@ -454,12 +460,12 @@ def _figures(
             "largest": round(float(lines.residual.max()), 4),
         },
         "predicted_error": {
-            # Of a time, in frames, and as far as the edge moves meanwhile.
-            "frames": round(error := float(np.median(times.error[np.isfinite(times.error)])), 4),
-            "pixels": round(error * float(np.median(speed)), 3),
+            # Of a time, in frames, and on the plane as far as the edge moves meanwhile.
+            "frames": round(float(np.median(times.error[np.isfinite(times.error)])), 4),
+            "pixels": round(float(np.median(times.error[y, x] * pace)), 3),
         },
         "bend": {"pixels": round(bend.pixels, 2), "certainty": round(min(bend.certainty, 1e6), 1)},
-        "pixels_per_frame": round(float(np.median(speed)), 3),
+        "pixels_per_frame": round(float(np.median(pace)), 3),
         "direction_degrees": round(math.degrees(float(lines.angle[len(lines) // 2])) % 360, 2),
         "turned_degrees": round(turned, 2),
     }

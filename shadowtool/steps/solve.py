@@ -10,7 +10,7 @@ from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.epipole import Epipole, find_epipole
 from shadowtool.core.parallax import measure_parallax
 from shadowtool.core.plane_fits import Windows, fit_planes
-from shadowtool.core.shadow_lines import line_speed
+from shadowtool.core.shadow_lines import line_pace, some_of
 from shadowtool.core.warp_map import Pass, WarpMap, identity_map, intersect, without_slips
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.run import Progress, no_progress
@@ -40,11 +40,10 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     """
     height, width = passes[0].times.time.shape
     positions = identity_map(height, width)
-    speeds = [line_speed(scan.lines, (height, width)) for scan in passes]
-    windows = Windows.for_step(max(float(np.median(speed)) for speed in speeds))
+    windows = Windows.for_step(max(map(_usual_pace, passes)))
     every = max(1, math.isqrt(height * width // _THIN))
     thin = slice(None, None, every)
-    found = intersect([scan.part(thin, thin) for scan in passes], speeds)
+    found = intersect([scan.part(thin, thin) for scan in passes], positions[thin, thin])
     epipole = find_epipole(found.warp, found.error, positions[thin, thin])
 
     def band(cut: tuple[slice, slice]) -> tuple[slice, WarpMap]:
@@ -52,9 +51,9 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
         own = [scan.part(rows) for scan in passes]
         here = positions[rows]
         if epipole is None:
-            part = _in_two_dimensions(own, here, speeds, windows, inner)
+            part = _in_two_dimensions(own, here, windows, inner)
         else:
-            part = _towards(epipole, own, here, speeds, windows, inner)
+            part = _towards(epipole, own, here, windows, inner)
         return slice(rows.start + inner.start, rows.start + inner.stop), part
 
     whole = WarpMap(np.empty((height, width, 2), np.float32), np.empty((height, width), np.float32))
@@ -66,16 +65,22 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     return Solved(without_slips(whole), epipole)
 
 
+def _usual_pace(scan: Pass) -> float:
+    """How fast the shadow passes most pixels, as if all lay on the plane; pixels a frame."""
+    y, x = some_of(np.isfinite(scan.times.time))
+    pace = line_pace(scan.lines, scan.times.time[y, x], np.stack([x, y], axis=-1))
+    return float(np.median(pace)) if pace.size else 0.0
+
+
 def _towards(
     epipole: Epipole,
     passes: list[Pass],
     positions: Float32,
-    speeds: list[NDArray[np.float64]],
     windows: Windows,
     wanted: slice,
 ) -> WarpMap:
     directions = epipole.directions(positions)
-    shift, error = measure_parallax(passes, positions, directions, speeds)
+    shift, error = measure_parallax(passes, positions, directions)
     shift, error = fit_planes(shift, error, windows, wanted)
     return WarpMap(positions[wanted] + shift[..., None] * directions[wanted], error)
 
@@ -83,11 +88,10 @@ def _towards(
 def _in_two_dimensions(
     passes: list[Pass],
     positions: Float32,
-    speeds: list[NDArray[np.float64]],
     windows: Windows,
     wanted: slice,
 ) -> WarpMap:
-    found = intersect(passes, speeds)
+    found = intersect(passes, positions)
     displacement = found.warp - positions
     # The predicted error is that of both coordinates together.
     each = (found.error / np.sqrt(2)).astype(np.float32)

@@ -16,7 +16,7 @@ import numpy as np
 
 from shadowtool.core.crossings import CrossingFinder
 from shadowtool.core.diffusion import diffuse
-from shadowtool.core.shadow_lines import fit_shadow_lines, line_speed, zero_crossings
+from shadowtool.core.shadow_lines import fit_shadow_lines, zero_crossings
 from shadowtool.core.shadow_time import (
     ShadowTimes,
     interpolated_times,
@@ -68,8 +68,7 @@ def paper_map(scene: str) -> WarpMap:
         count = np.arange(len(numbers), dtype=np.float64)
         lines = fit_shadow_lines(zero_crossings(time, region, count), count)
         passes.append(Pass(ShadowTimes.alone(time, contrast), lines))
-    speeds = [line_speed(one.lines, region.shape) for one in passes]
-    return diffuse(intersect(passes, speeds), 40)
+    return diffuse(intersect(passes, identity_map(*region.shape)), 40)
 
 
 def figures(scene: str, found: WarpMap) -> dict[str, float]:

@@ -8,7 +8,7 @@ from shadowtool.core import color_line, diffusion, pictures, shadow_time, warp_m
 from shadowtool.core.crossings import CrossingFinder, Crossings
 from shadowtool.core.half_floats import rounded
 from shadowtool.core.noise import NoiseModel
-from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines, line_speed
+from shadowtool.core.shadow_lines import ShadowLines, interpolate_lines, line_pace
 from shadowtool.core.warp_map import WarpMap
 from tests.core.contracts import TAME, UNIT, WILD, Contract, array, is_kept, picture, plane
 
@@ -206,10 +206,10 @@ CONTRACTS = {
             and np.allclose(np.hypot(*r.normal[np.isfinite(r.offset)].T), 1)
         ),
     ),
-    "line_speed": Contract(
-        lambda found, times: line_speed(found, (40, 60)),
+    "line_pace": Contract(
+        lambda found, times: line_pace(found, times, np.ones((len(times), 2))),
         turning,
-        lambda r, found, times: r.shape == found.offset.shape and (r >= 0).all(),
+        lambda r, found, times: r.shape == times.shape and (r >= 0).all(),
     ),
     "line_distance": Contract(
         lambda c, lit, s: color_line.line_distance(c, lit, s, MODEL, 0.01),

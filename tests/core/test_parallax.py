@@ -3,7 +3,6 @@ import pytest
 
 from shadowtool.core.epipole import find_epipole
 from shadowtool.core.parallax import measure_parallax
-from shadowtool.core.shadow_lines import line_speed
 from shadowtool.core.shadow_time import ShadowTimes
 from shadowtool.core.warp_map import Pass, identity_map
 from tests.core.test_shadow_lines import SCENE
@@ -18,8 +17,7 @@ DIRECTIONS = np.broadcast_to(
 
 
 def measured(scans: list[Pass]) -> tuple[np.ndarray, np.ndarray]:
-    speeds = [line_speed(scan.lines, (SCENE.height, SCENE.width)) for scan in scans]
-    return measure_parallax(scans, POSITIONS, DIRECTIONS, speeds)
+    return measure_parallax(scans, POSITIONS, DIRECTIONS)
 
 
 @pytest.mark.parametrize("angles", [(0.2, 1.7), (0.2, 1.3, 2.4)])

@@ -8,6 +8,7 @@ from shadowtool.core.shadow_lines import (
     fit_shadow_lines,
     interpolate_lines,
     line_bend,
+    line_pace,
     off_lines,
     zero_crossings,
 )
@@ -175,6 +176,19 @@ def test_interpolated_lines_lie_between_and_keep_their_length() -> None:
     between = interpolate_lines(lines, np.array([lines.frame[5] + 0.5]))
     assert errors(between, sweep)[0] < 0.1
     assert np.hypot(*between.normal.T) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_lines_that_fan_out_pass_what_is_far_from_their_middle_faster(every: int) -> None:
+    frame = np.arange(0.0, 12, every)
+    normal = np.stack([np.cos(0.1 * frame), np.sin(0.1 * frame)], axis=-1)
+    nothing = np.zeros(len(frame))
+    fan = ShadowLines(frame, normal, nothing, nothing, nothing.astype(int), ("fit",) * len(frame))
+    times = np.float64([0, 3.5, 9, 11])
+    along = np.stack([-np.sin(0.1 * times), np.cos(0.1 * times)], axis=-1)
+    for far in (10, 300):
+        pace = line_pace(fan, times, far * along)
+        assert pace == pytest.approx(np.full(4, 0.1 * far), rel=0.07)
 
 
 def test_times_outside_the_sweep_have_no_line() -> None:

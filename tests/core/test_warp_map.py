@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowtool.core.shadow_lines import line_speed
 from shadowtool.core.shadow_time import ShadowTimes
 from shadowtool.core.warp_map import (
     Pass,
@@ -39,7 +38,7 @@ def passes(angles: tuple[float, ...] = ANGLES) -> list[Pass]:
 
 
 def intersected(scans: list[Pass]) -> WarpMap:
-    return intersect(scans, [line_speed(scan.lines, (SCENE.height, SCENE.width)) for scan in scans])
+    return intersect(scans, identity_map(SCENE.height, SCENE.width))
 
 
 @pytest.mark.parametrize("angles", [(0.2, 1.7), ANGLES, (0.1, 0.9, 1.7, 2.5, 4.0)])
@@ -90,13 +89,11 @@ def test_lines_of_three_passes_that_do_not_meet_are_known_to_be_off() -> None:
     assert np.nanmedian(intersected([two, Pass(late, three.lines)]).error[known]) < 2
 
 
-def test_angles_and_speed_are_those_of_the_sweeps() -> None:
+def test_angles_are_those_of_the_sweeps() -> None:
     angles = {(i, j): angle for i, j, angle in pass_angles(passes((0.2, 1.3, 3.2)))}
     assert angles == pytest.approx(
         {(0, 1): 1.1, (0, 2): np.pi - 3.0, (1, 2): np.pi - 1.9}, abs=0.01
     )
-    for scan in passes():
-        assert np.median(line_speed(scan.lines, (90, 160))) == pytest.approx(3.3, abs=0.02)
 
 
 def test_confidence_and_error_are_inverse() -> None:

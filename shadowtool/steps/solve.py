@@ -10,7 +10,7 @@ from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.epipole import Epipole, find_epipole
 from shadowtool.core.parallax import measure_parallax
 from shadowtool.core.plane_fits import Windows, fit_planes
-from shadowtool.core.shadow_lines import line_pace, some_of
+from shadowtool.core.shadow_lines import line_pace
 from shadowtool.core.warp_map import Pass, WarpMap, identity_map, intersect, without_slips
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.run import Progress, no_progress
@@ -66,10 +66,12 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
 
 
 def _usual_pace(scan: Pass) -> float:
-    """How fast the shadow passes most pixels, as if all lay on the plane; pixels a frame."""
-    y, x = some_of(np.isfinite(scan.times.time))
-    pace = line_pace(scan.lines, scan.times.time[y, x], np.stack([x, y], axis=-1))
-    return float(np.median(pace)) if pace.size else 0.0
+    """How fast most lines pass the middle of the picture, pixels a frame."""
+    lines, (height, width) = scan.lines, scan.times.time.shape
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    away = lines.normal @ middle + lines.offset
+    nearest = middle - away[:, np.newaxis] * lines.normal
+    return float(np.median(line_pace(lines, lines.frame, nearest)))
 
 
 def _towards(

@@ -118,10 +118,11 @@ def fit_shadow_lines(groups: dict[int, Float64], frames: Float64) -> ShadowLines
 
 
 def interpolate_lines(lines: ShadowLines, times: Float64) -> ShadowLines:
-    """The lines at any times, linearly between the neighbouring ones (step 2a of the outline).
+    """The lines at any times between the first and the last (step 2a of the outline).
 
     The angle is interpolated, not the slope; the offset is taken about the lines' common middle,
-    where it hardly depends on the angle.
+    where it hardly depends on the angle. Both on a smooth curve: a board that moves evenly over the
+    ground gains or loses speed in the picture.
 
     Args:
         times: (N,) frame numbers; outside the lines' span the result is NaN.
@@ -130,9 +131,9 @@ def interpolate_lines(lines: ShadowLines, times: Float64) -> ShadowLines:
     inside = (times >= lines.frame[0]) & (times <= lines.frame[-1])
     pivot = _pivot(lines)
     about = lines.offset + lines.normal @ pivot
-    angle = np.interp(times, lines.frame, lines.angle)
+    angle = _curve(times, lines.frame, lines.angle)
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    offset = np.interp(times, lines.frame, about) - (normal * pivot).sum(axis=-1)
+    offset = _curve(times, lines.frame, about) - (normal * pivot).sum(axis=-1)
     residual = np.interp(times, lines.frame, lines.residual)
     normal[~inside] = np.nan
     offset[~inside] = np.nan
@@ -140,6 +141,20 @@ def interpolate_lines(lines: ShadowLines, times: Float64) -> ShadowLines:
     none = np.zeros(len(times), np.int64)
     origin: list[Origin] = ["interpolated"] * len(times)
     return ShadowLines(times, normal, offset, residual, none, tuple(origin))
+
+
+def _curve(times: Float64, frames: Float64, values: Float64) -> Float64:
+    """Values between frames on cubics that have the slope of both neighbours at each."""
+    if len(frames) < 3:
+        return np.interp(times, frames, values)
+    first = np.clip(np.searchsorted(frames, times, side="right") - 1, 0, len(frames) - 2)
+    last, step = first + 1, np.diff(frames)[first]
+    slope = np.gradient(values, frames)
+    # Hermite's basis.
+    u = np.clip((times - frames[first]) / step, 0, 1)
+    near, far = (1 - u) ** 2, u**2
+    ends = near * (1 + 2 * u) * values[first] + far * (3 - 2 * u) * values[last]
+    return np.asarray(ends + step * u * (1 - u) * ((1 - u) * slope[first] - u * slope[last]))
 
 
 def line_pace(

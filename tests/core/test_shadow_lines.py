@@ -178,6 +178,21 @@ def test_interpolated_lines_lie_between_and_keep_their_length() -> None:
     assert np.hypot(*between.normal.T) == pytest.approx(1)
 
 
+def test_a_board_that_gains_speed_in_perspective_is_followed_between_the_frames() -> None:
+    def at(time: np.ndarray) -> ShadowLines:
+        nothing = np.zeros(len(time))
+        angle = 0.3 + 0.02 * (20 - time) ** 0.5
+        normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        fit = ("fit",) * len(time)
+        return ShadowLines(time, normal, -2000 / (20 - time), nothing, nothing.astype(int), fit)
+
+    lines, between = at(np.arange(16.0)), np.linspace(1, 14, 80)
+    found, true = interpolate_lines(lines, between), at(between)
+    straight = np.interp(between, lines.frame, lines.offset)
+    assert np.abs(found.offset - true.offset).max() < 0.2 * np.abs(straight - true.offset).max()
+    assert np.abs(found.angle - true.angle).max() < 1e-3
+
+
 @pytest.mark.parametrize("every", [1, 3])
 def test_lines_that_fan_out_pass_what_is_far_from_their_middle_faster(every: int) -> None:
     frame = np.arange(0.0, 12, every)

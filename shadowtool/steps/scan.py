@@ -80,6 +80,9 @@ _TREMBLING, _NO_SWEEP, _ON_LINES = 2.0, 4.0, 0.5
 # Pixels of the plane are off the lines of their times by more than this, pixels; and so many are
 # only if something is wrong.
 _OFF, _MANY_OFF = 2.0, 0.06
+# More than this of what a sweep reached has times at which no edge lay on the plane only if too
+# little of the plane is marked.
+_BEYOND = 0.3
 # Between frames so many times further apart than usual the shadow passes more than can be told.
 _HOLE = 3.0
 # If more of the frame than this can't be told from one reading, the frames are read again.
@@ -426,6 +429,13 @@ def _advise(figures: Figures, footage: Footage) -> None:
             take,
             100 * figures["off_lines"],
         )
+    if figures["beyond_lines"] > _BEYOND:
+        logger.warning(
+            "%s: the shadow reached %.0f%% of what it did before or after it crossed the plane, and"
+            " W is unknown there; mark a larger plane, or sweep across it",
+            take,
+            100 * figures["beyond_lines"],
+        )
     if figures["pixels_per_frame"] > _FAST:
         logger.warning(
             "%s: the shadow moves %.0f pixels a frame; small things fall between two frames,"
@@ -442,6 +452,8 @@ def _figures(
     gains: dict[Frame, float],
     bend: Bend,
 ) -> Figures:
+    known = times.time[np.isfinite(times.time)]
+    beyond = (known < lines.frame[0]) | (known > lines.frame[-1])
     y, x = some_of(region & np.isfinite(times.time))
     pace = line_pace(lines, times.time[y, x], np.stack([x, y], axis=-1))
     turned = math.degrees(float(lines.angle[-1] - lines.angle[0]))
@@ -450,6 +462,7 @@ def _figures(
         "frames": len(gains),
         "gain": {"least": round(min(gains.values()), 4), "most": round(max(gains.values()), 4)},
         "reached": round(float(np.isfinite(times.time).mean()), 4),
+        "beyond_lines": round(float(beyond.mean()), 4) if beyond.size else 0.0,
         "lines": {
             "first": float(lines.frame[0]),
             "last": float(lines.frame[-1]),

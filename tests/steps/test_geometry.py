@@ -308,6 +308,17 @@ def test_a_camera_that_trembles_is_told_by_times_that_differ_by_more_than_noise(
     assert "frames are moved to one place" in caplog.text
 
 
+def test_a_plane_marked_too_small_is_told_of(
+    tmp_path: Path, mask: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = shoot(tmp_path / "frames", SWEEPS["first"])
+    whole = scan(frames, tmp_path / "whole", plane=mask).figures
+    assert "mark a larger plane" not in caplog.text
+    part = scan(frames, tmp_path / "part", plane="0,0 60,0 60,89 0,89").figures
+    assert "mark a larger plane" in caplog.text
+    assert whole["beyond_lines"] < 0.1 < 0.5 < part["beyond_lines"]
+
+
 def test_a_take_that_is_no_sweep_is_to_be_shot_again(tmp_path: Path, mask: str) -> None:
     folder = tmp_path / "walk"
     folder.mkdir()

@@ -3,6 +3,7 @@
 Perona and Malik 1990, with the flow from pixels that can be trusted to pixels that can't.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,10 +12,18 @@ from shadowtool.core.filling import fill_membrane
 from shadowtool.core.warp_map import WarpMap, identity_map
 
 Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+# What is unknown up to the frame's edge is connected by more than this width, pixels.
+_NARROW = 5
 
 
 def diffuse(
-    warp_map: WarpMap, iterations: int = 40, edge: float = 1.5, rate: float = 0.24
+    warp_map: WarpMap,
+    iterations: int = 40,
+    edge: float = 1.5,
+    rate: float = 0.24,
+    plane_beyond: bool = False,
 ) -> WarpMap:
     """Anisotropic diffusion of the displacement W[p] - p, confidence-driven.
 
@@ -26,6 +35,8 @@ def diffuse(
         iterations: steps; 0 only fills.
         edge: the difference in pixels that counts as a depth edge.
         rate: step size, at most 0.25.
+        plane_beyond: take what is unknown up to the frame's edge, where no sweep went, for the
+            reference plane, whose displacement is 0; otherwise it goes on as what is next to it.
 
     Returns:
         W without NaN, unless nothing at all is known. The predicted error stays what it was, and
@@ -37,9 +48,11 @@ def diffuse(
     if unknown.all():
         return warp_map
     trust = np.where(unknown, np.float32(1e-3), warp_map.confidence).astype(np.float32)
+    weight = np.where(unknown, np.float32(0), warp_map.confidence)
+    if plane_beyond:
+        weight[_open_to_the_edge(unknown)] = 1
     displacement = fill_membrane(
-        np.where(unknown[..., np.newaxis], np.float32(0), warp_map.warp - identity),
-        np.where(unknown, np.float32(0), warp_map.confidence),
+        np.where(unknown[..., np.newaxis], np.float32(0), warp_map.warp - identity), weight
     )
     smooth = np.empty_like(displacement)
     for rows, inner in overlapping_bands(height, iterations):
@@ -48,6 +61,18 @@ def diffuse(
         ]
     smooth += identity
     return WarpMap(smooth, np.where(unknown, np.float32(np.inf), warp_map.error))
+
+
+def _open_to_the_edge(unknown: Bool) -> Bool:
+    """The unknown parts that the frame's edge cuts off."""
+    size = np.ones((_NARROW, _NARROW), np.uint8)
+    # Beyond the edge all is unknown.
+    outside = np.pad(unknown.view(np.uint8), _NARROW, constant_values=1)
+    wide = np.asarray(cv2.morphologyEx(outside, cv2.MORPH_OPEN, size), np.uint8)
+    _, labels = cv2.connectedComponents(wide, connectivity=4)
+    reached = cv2.dilate((labels == labels[0, 0]).view(np.uint8), size)
+    inner = slice(_NARROW, -_NARROW)
+    return np.asarray((reached[inner, inner] > 0) & unknown)
 
 
 def _diffused(

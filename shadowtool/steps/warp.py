@@ -225,10 +225,10 @@ def _solve(
             every.require_angles()
     shown = _gray(target.passes)
     measured, figures = target.solve(run, output)
-    result = diffuse(measured, iterations)
+    result = diffuse(measured, iterations, plane_beyond=True)
     if source is not None:
         own, figures["source"] = source.solve(run, output)
-        onward = invert(diffuse(own, iterations))
+        onward = invert(diffuse(own, iterations, plane_beyond=True))
         measured = compose(result, onward)
         seen = float(np.isfinite(measured.error).mean())
         if seen < _LEAST_KNOWN:

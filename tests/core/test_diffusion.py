@@ -43,6 +43,23 @@ def test_unknown_pixels_are_filled_and_say_so() -> None:
     assert (filled.confidence[70:80, 20:40] == 0).all()
 
 
+def test_where_no_sweep_went_is_the_plane_and_a_hole_is_what_is_around_it() -> None:
+    known = noisy_map(0.0)
+    unknown = np.zeros(known.error.shape, bool)
+    # A strip along the frame's edge that cuts the block, with a crack from it to a hole within.
+    unknown[: SCENE.rows[0] + 8] = True
+    hole = slice(SCENE.rows[0] + 14, SCENE.rows[0] + 20), slice(70, 80)
+    unknown[hole] = unknown[SCENE.rows[0] + 8 : SCENE.rows[0] + 14, 75] = True
+    warp = np.where(unknown[..., None], np.float32(np.nan), known.warp)
+    error = np.where(unknown, np.float32(np.inf), known.error)
+    filled = diffuse(WarpMap(warp, error), iterations=0, plane_beyond=True).warp
+    identity = identity_map(SCENE.height, SCENE.width)
+    assert np.array_equal(filled[: SCENE.rows[0] + 8], identity[: SCENE.rows[0] + 8])
+    assert distance(filled)[hole].max() < 0.5
+    on = diffuse(WarpMap(warp, error), iterations=0).warp - identity
+    assert np.linalg.norm(on[SCENE.rows[0], 75]) > 3
+
+
 def test_what_is_well_known_is_not_moved_by_what_is_not() -> None:
     known = noisy_map(0.0, 0.05)
     warp, error = known.warp.copy(), known.error.copy()

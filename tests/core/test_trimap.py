@@ -94,6 +94,14 @@ def test_where_motion_blurs_the_edge_the_band_stays_wide() -> None:
     assert (narrowed(trimap, prior, mask)[before][mixed[before]] == UNKNOWN).all()
 
 
+def test_a_limb_in_motion_on_a_figure_that_stands_is_expected_to_be_blurred() -> None:
+    hand = in_motion(lambda time: disk(118 + 5 * time, 50, 12))
+    alpha = np.max([disk(50, 50, 32), strand((50, 50), (110, 50), 11), hand], axis=0)
+    _, prior = prior_of(alpha, alpha > 0.1)
+    blurred = (alpha > 0.05) & (alpha < 0.8) & (disk(140, 50, 18) > 0)
+    assert np.abs(prior.mean - alpha)[blurred].mean() < 0.25
+
+
 def test_another_colour_at_the_rim_is_not_taken_for_blur() -> None:
     alpha = disk(80, 50, 25)
     found = np.where(disk(80, 50, 21) > 0, alpha, 0.5 * alpha)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
-from shadowtool.core.trimap_flow import Carried, carry, flow_picture, links, merge
+from shadowtool.core.trimap_flow import Carried, Link, carry, flow_picture, links, merge
 from tests.figures import SCENE, disk
 
 RNG = np.random.default_rng(3)
@@ -42,6 +42,13 @@ def test_links_follow_the_figure_and_leave_the_ground_alone() -> None:
     assert np.median(there.error[inside]) < 0.2
 
 
+def test_what_only_one_of_two_frames_shows_is_lost() -> None:
+    there, _ = links(flow_picture(frame(0)), flow_picture(SCENE.lit))
+    hidden, far = disk(50, 50, 18) == 1, disk(50, 50, 45) == 0
+    assert np.median(there.error[hidden]) > 0.5
+    assert np.median(there.error[far]) < 0.1
+
+
 def test_a_keyframe_is_carried_to_where_the_figure_has_gone() -> None:
     back, _ = ways(5, 3)
     carried = carry(drawn(0), back)
@@ -55,6 +62,15 @@ def test_the_further_it_is_carried_the_less_is_known() -> None:
     near, far = carry(drawn(5), back[:1]), carry(drawn(0), back)
     assert (near.trimap == UNKNOWN).sum() < (far.trimap == UNKNOWN).sum()
     assert near.error.mean() < far.error.mean()
+
+
+def test_every_step_adds_to_the_error() -> None:
+    shape = SCENE.lit.shape[:2]
+    still = Link(np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
+    one, many = carry(drawn(0), [still]), carry(drawn(0), [still] * 8)
+    assert (many.error > one.error).all()
+    assert (one.trimap == UNKNOWN).sum() < (many.trimap == UNKNOWN).sum()
+    assert np.isinf(carry(drawn(0), [still] * 30).error).all()
 
 
 def test_without_a_way_it_is_as_drawn() -> None:

@@ -88,6 +88,18 @@ def test_a_hard_edge_stays_where_it_is() -> None:
     assert (cleared[:, :70] > 0.8).all() and (cleared[:, 70:] < 0.2).all()
 
 
+@pytest.mark.parametrize(("level", "found"), [(0.4, 0.9), (0.65, 1.0)])
+def test_a_lone_pixel_is_shaded_if_it_is_darker_than_noise_makes_it(
+    level: float, found: float
+) -> None:
+    beta, weight = np.ones((15, 15), np.float32), np.full((15, 15), 100, np.float32)
+    beta[7, 7] = level
+    cleared = without_noise(beta, weight)
+    assert cleared[7, 7] <= found
+    cleared[7, 7] = 1
+    assert (cleared == 1).all()
+
+
 def test_what_is_unknown_stays_so_and_does_not_spread() -> None:
     beta = filmed(disk_beta())
     beta[30:34, 60:66] = np.nan

@@ -70,6 +70,17 @@ def test_what_is_well_known_is_not_moved_by_what_is_not() -> None:
     assert distance(smooth.warp)[10:80, 121].mean() < 0.7
 
 
+def test_a_bump_flows_to_all_four_sides_alike() -> None:
+    still = identity_map(9, 9)
+    warp = still.copy()
+    warp[4, 4, 0] += 0.5
+    bump = diffuse(WarpMap(warp, np.ones((9, 9), np.float32)), iterations=1).warp - still
+    around = [bump[y, x, 0] for y, x in ((3, 4), (5, 4), (4, 3), (4, 5))]
+    assert around == pytest.approx([around[0]] * 4, abs=1e-6)
+    assert around[0] > 0.04
+    assert bump[..., 0].sum() == pytest.approx(0.5, abs=1e-5)
+
+
 def test_rows_worked_on_at_a_time_leave_no_seam() -> None:
     rng = np.random.default_rng(2)
     warp = identity_map(300, 9) + rng.normal(size=(300, 9, 2)).astype(np.float32)

@@ -92,6 +92,19 @@ def test_frames_are_counted_right() -> None:
     assert (found.shadow_frames / shaded).mean() > 0.97
 
 
+def test_a_pixel_that_is_lit_only_in_frames_left_out_is_as_dark_as_it_is_seen() -> None:
+    lit, shaded = (np.full((4, 5, 3), value, np.float16) for value in (0.5, 0.1))
+    levels = SampledLevels(4, 5)
+    for _ in range(3):
+        levels.add(keyed(lit).gray)
+    plates = RobustPlates(levels.levels(), NOISE)
+    for _ in range(4):
+        plates.add(keyed(shaded))
+    found = plates.measured()
+    assert np.array_equal(found.lit, shaded) and np.array_equal(found.shadow, shaded)
+    assert (found.lit_frames == 4).all()
+
+
 def bird(frames: list[np.ndarray], when: list[int], colour: float) -> list[np.ndarray]:
     for number in when:
         frames[number][20:30, 30:40] = colour

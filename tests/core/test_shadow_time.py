@@ -85,6 +85,15 @@ def test_noise_alone_has_no_time() -> None:
     assert np.isnan(paper_times(frames)).mean() > 0.999
 
 
+def test_noise_in_deep_shade_has_no_time() -> None:
+    rng = np.random.default_rng(0)
+    finder = CrossingFinder()
+    for _ in range(20):
+        finder.add(luminance(rng.normal(0.004, 0.001, (40, 60, 3)).astype(np.float32)))
+    found = significant(finder.found(), NoiseModel(np.zeros(3), np.full(3, 1e-6)))
+    assert not found.at.any() and not found.lost.any()
+
+
 def test_a_broken_pixel_does_not_spread() -> None:
     frames = sweep_frames(Sweep(0.0, soft=8.0))
     clean = paper_times(frames)

@@ -1,12 +1,17 @@
 """Figure and shadow in the target scene, from files."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from shadowtool.choices import Fill
+from shadowtool.core.beta import inpaint
 from shadowtool.core.compositing import over, shade
+from shadowtool.core.warp_map import WarpMap, identity_map
 from shadowtool.io.image import Header, read_image, write_exr, write_png
+from shadowtool.io.products import WARP, write_warp
 from shadowtool.steps.composite import composite
 from tests.scene import Scene
 
@@ -94,3 +99,86 @@ def test_what_plates_in_png_are_taken_for_is_said(
         write_png(tmp_path / "coded" / f"{name}.png", codes)
     composite(tmp_path / "matte", tmp_path / "again", plates=tmp_path / "coded")
     assert "coded: PNG is taken as srgb" in caplog.text
+
+
+def with_holes() -> np.ndarray:
+    beta = BETA.astype(np.float32)
+    beta[25:30, 38:44] = np.nan
+    return beta
+
+
+def again(tmp_path: Path, beta: np.ndarray, fill: Fill = "lit") -> np.ndarray:
+    """The composite without a figure under this β, (H, W) or (H, W, 3)."""
+    put(tmp_path, empty())
+    layer = "Y" if beta.ndim == 2 else "RGB"
+    half = beta.astype(np.float16)
+    write_exr(tmp_path / "matte" / "beta" / "beta.1001.exr", {layer: half}, HEADER)
+    result = composite(
+        tmp_path / "matte", tmp_path / "again", plates=tmp_path / "plates", fill=fill
+    )
+    assert result.figures["unknown"] == np.isnan(with_holes()).sum()
+    return read_image(tmp_path / "again" / "again.1001.exr").layers["RGB"]
+
+
+FILLED: list[tuple[Fill, Callable[[np.ndarray], np.ndarray]]] = [
+    ("lit", lambda beta: np.nan_to_num(beta, nan=1)),
+    ("inpaint", inpaint),
+    ("none", np.copy),
+]
+
+
+@pytest.mark.parametrize(("fill", "filled"), FILLED)
+def test_what_unknown_beta_becomes(
+    tmp_path: Path, fill: Fill, filled: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    beta = with_holes()
+    wanted = shade(SCENE.lit, SCENE.shadow, filled(beta)).astype(np.float16)
+    assert np.array_equal(again(tmp_path, beta, fill), wanted, equal_nan=True)
+
+
+@pytest.mark.parametrize(("fill", "filled"), FILLED)
+def test_unknown_beta_is_filled_in_each_channel(
+    tmp_path: Path, fill: Fill, filled: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    gray = with_holes()
+    beta = np.dstack([gray, np.sqrt(gray), gray**2]).astype(np.float16).astype(np.float32)
+    whole = np.dstack([filled(beta[..., channel]) for channel in range(3)])
+    wanted = shade(SCENE.lit, SCENE.shadow, whole).astype(np.float16)
+    assert np.array_equal(again(tmp_path, beta, fill), wanted, equal_nan=True)
+
+
+def test_png_holds_the_same_light(tmp_path: Path) -> None:
+    light = np.minimum(put(tmp_path, spots()), 1)
+    mattes, plates = tmp_path / "matte", tmp_path / "plates"
+    composite(mattes, tmp_path / "coded", plates=plates, file_format="png")
+    image = read_image(tmp_path / "coded" / "coded.1001.png")
+    assert image.layers["RGB"].dtype == np.uint16
+    assert image.rgb() == pytest.approx(light, abs=1e-3)
+
+
+def test_unknown_pixels_of_plates_are_continued_from_around_and_told_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = put(tmp_path, empty())
+    lit = SCENE.lit.copy()
+    lit[10:12, 20:23] = np.nan
+    write_exr(tmp_path / "plates" / "lit.exr", {"RGB": lit}, HEADER)
+    composite(tmp_path / "matte", tmp_path / "again", plates=tmp_path / "plates")
+    assert "plates: 6 pixels of the plates are unknown" in caplog.text
+    found = read_image(tmp_path / "again" / "again.1001.exr").layers["RGB"]
+    hole = np.isnan(lit).any(axis=-1)
+    assert np.array_equal(found[~hole], whole[~hole])
+    assert found[hole] == pytest.approx(whole[hole], rel=0.5)
+
+
+def test_what_a_map_takes_from_outside_the_picture_is_lit(tmp_path: Path) -> None:
+    put(tmp_path, empty())
+    dark = np.zeros_like(BETA)
+    write_exr(tmp_path / "matte" / "beta" / "beta.1001.exr", {"Y": dark}, HEADER)
+    aside = identity_map(SCENE.height, SCENE.width) + np.float32([20, 0])
+    stmap = tmp_path / WARP
+    write_warp(stmap, WarpMap(aside, np.zeros(dark.shape, np.float32)), HEADER, {})
+    composite(tmp_path / "matte", tmp_path / "again", plates=tmp_path / "plates", warp=stmap)
+    found = read_image(tmp_path / "again" / "again.1001.exr").layers["RGB"]
+    assert found[:, -19:] == pytest.approx(SCENE.lit[:, -19:], rel=2e-3)
+    assert found[:, :-21] == pytest.approx(SCENE.shadow[:, :-21], rel=2e-3)

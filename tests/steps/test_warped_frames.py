@@ -88,3 +88,21 @@ def test_grain_is_written_without_a_long_search(
     monkeypatch.setattr("shadowtool.steps.warp.write_exr", write)
     warp([], tmp_path / "out", map_file=identity, apply_to=tmp_path / "take")
     assert said == [expected]
+
+
+def test_a_map_fits_pictures_of_any_size(tmp_path: Path) -> None:
+    aside = identity_map(HEIGHT, WIDTH) + np.float32([2, 0])
+    found = WarpMap(aside, np.zeros((HEIGHT, WIDTH), np.float32))
+    write_warp(tmp_path / "map.exr", found, HEADER, {})
+    (tmp_path / "take").mkdir()
+    y, x = np.mgrid[: 2 * HEIGHT, : 2 * WIDTH].astype(np.float32)
+    write_exr(tmp_path / "take" / "take.1001.exr", {"x": x, "y": y})
+    options = {"map_file": tmp_path / "map.exr", "apply_to": tmp_path / "take"}
+    warp([], tmp_path / "out", outside=-1, **options)
+    layers = read_image(tmp_path / "out" / "take" / "take.1001.exr").layers
+    # A pixel of the map, two to the right, is the middle of four pixels of the picture.
+    inside = np.s_[:, : WIDTH - 2]
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    assert layers["x"][inside] == pytest.approx(2 * (x + 2)[inside] + 0.5, abs=1e-4)
+    assert layers["y"][inside] == pytest.approx(2 * y[inside] + 0.5, abs=1e-4)
+    assert (layers["x"][:, WIDTH - 2 :] == -1).all()

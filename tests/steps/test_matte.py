@@ -7,9 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shadowtool.core.trimap import BACKGROUND, FIGURE
 from shadowtool.errors import InputError
 from shadowtool.io.image import Header, decode, read_image, write_exr, write_png
+from shadowtool.io.sequence import open_sequence
 from shadowtool.steps.composite import composite
+from shadowtool.steps.footage import open_footage
+from shadowtool.steps.keyframes import Keyframes
 from shadowtool.steps.matte import matte
 from shadowtool.steps.run import Run
 from tests.figures import SCENE, Shot, disk, shot
@@ -131,6 +135,42 @@ def test_trimaps_are_carried_past_a_damaged_frame(take: Path, tmp_path: Path) ->
         assert np.abs(alpha - figure(number).alpha).mean() < 0.004
 
 
+@pytest.mark.parametrize("number", [1002, 1006])
+def test_a_keyframe_is_carried_forwards_and_backwards(
+    take: Path, tmp_path: Path, number: int
+) -> None:
+    (tmp_path / "drawn").mkdir()
+    write_png(tmp_path / "drawn" / "trimap.1004.png", drawn(1004))
+    drawings = open_sequence(tmp_path / "drawn")
+    keyframes = Keyframes.of(drawings, open_footage(take / "source"), "error")
+    # Without the mark in the corner.
+    trimap, alpha = keyframes.trimap(number)[8:], figure(number).alpha[8:]
+    assert (alpha[trimap == FIGURE] > 0).mean() > 0.97
+    assert (alpha[trimap == BACKGROUND] < 1).mean() > 0.99
+    assert (trimap == FIGURE).sum() > 0.5 * alpha.sum()
+
+
+def test_what_was_drawn_helps_in_the_frames_between(take: Path, tmp_path: Path) -> None:
+    for folder in ("source", "drawn"):
+        (tmp_path / folder).mkdir()
+    alpha = disk(60, 45, 18)
+    # Cloth of nearly the ground's own texture and colour.
+    cloth = 0.63 * SCENE.lit + 0.07 * SCENE.lit.mean(axis=(0, 1))
+    image = alpha[..., None] * cloth + (1 - alpha[..., None]) * SCENE.lit
+    for number in (1001, 1002, 1003):
+        noisy = SCENE.noisy(image, number).astype(np.float16)
+        write_exr(tmp_path / "source" / f"source.{number}.exr", {"RGB": noisy}, HEADER)
+    trimap = np.where(alpha == 1, 255, np.where(alpha > 0, 128, 0)).astype(np.uint8)
+    for number in (1001, 1003):
+        write_png(tmp_path / "drawn" / f"trimap.{number}.png", trimap)
+    off = []
+    for name, given in (("alone", None), ("helped", tmp_path / "drawn")):
+        matte(tmp_path / "source", tmp_path / name, plates=take / "plates", trimap=given)
+        _, found = read_image(tmp_path / name / "fg" / "fg.1002.exr").rgba()
+        off.append(np.abs(found - alpha).mean())
+    assert off[1] < 0.5 * off[0]
+
+
 def test_bands_change_no_bit(pull: Callable[..., Path], tree, narrow_bands) -> None:
     whole = pull("whole")
     narrow_bands()
@@ -165,6 +205,31 @@ def test_an_edge_of_a_given_alpha_is_coloured_without_the_ground(
     rim = (true.alpha > 0.3) & (true.alpha < 1)
     found = colour[rim] / true.alpha[rim][:, None]
     assert np.abs(found - true.foreground[rim]).mean() < 0.02
+
+
+def test_beta_is_relied_on_as_far_as_the_figure_shows_the_ground(
+    pull: Callable[..., Path],
+) -> None:
+    out = pull("out")
+    confidence = read_image(out / "beta" / "beta.1004.exr").plane("confidence")
+    _, alpha = read_image(out / "fg" / "fg.1004.exr").rgba()
+    whole = np.median(confidence[alpha == 0])
+    assert whole > 0.9
+    edge = (alpha > 0.1) & (alpha < 0.5)
+    assert confidence[edge] == pytest.approx((1 - alpha[edge]) * whole, abs=0.05)
+    assert (confidence[alpha >= 0.5] == 0).all()
+
+
+def test_beta_is_not_relied_on_where_the_plates_know_no_shadow(take: Path, tmp_path: Path) -> None:
+    (tmp_path / "plates").mkdir()
+    shadow = SCENE.shadow.copy()
+    shadow[:30, :40] = SCENE.lit[:30, :40]
+    for name, plate in (("lit", SCENE.lit), ("shadow", shadow)):
+        write_exr(tmp_path / "plates" / f"{name}.exr", {"RGB": plate}, HEADER)
+    matte(take / "source", tmp_path / "out", plates=tmp_path / "plates", run=Run(frames="1008"))
+    image = read_image(tmp_path / "out" / "beta" / "beta.1008.exr")
+    assert (image.plane("confidence")[:30, :40] == 0).all()
+    assert np.isfinite(image.plane("Y")).all()
 
 
 def test_a_trimap_that_was_made_linear_keeps_its_edge(

@@ -18,7 +18,8 @@ import pytest
 from shadowtool.cli.commands import shadowtool
 from shadowtool.cli.options import PROGRESS
 from shadowtool.io.image import write_png
-from tests.conftest import write_frames
+from shadowtool.io.products import read_warp, write_warp
+from tests.conftest import PLANE, write_frames
 
 COMMANDS = ("capture", "plate", "matte", "scan", "warp", "apply", "composite")
 PER_FRAME = ("capture", "matte", "apply", "composite")
@@ -140,6 +141,13 @@ def test_overwrite_replaces_what_is_there(name, make, tree):
         (output / path).write_bytes(b"spoiled")
     make(name, "once", "--overwrite")
     assert tree(output) == before
+
+
+def test_overwrite_replaces_the_record_of_another_step(shot, copied, command):
+    folder = copied("scan1")
+    outcome = command(*shot.arguments("plate"), "-o", folder, "--overwrite")
+    assert outcome.code == 0, outcome.err
+    assert json.loads((folder / "shadowtool.json").read_text())["step"] == "plate"
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -264,6 +272,40 @@ def test_resume_starts_anew_when_an_input_changed(
     make(name, "once", "--resume", words=words)
     assert tree(output)["shadowtool.json"] != manifest
     assert tree(output) == tree(make(name, "anew", words=words))
+
+
+@pytest.mark.parametrize("name", ["apply", "composite"])
+def test_resume_starts_anew_with_another_map(name, make, shot, copied, tree):
+    stmap = copied("warp") / "warp.exr"
+    arguments = shot.arguments(name)
+    words = replaced(arguments, arguments.index(str(shot.warp / "warp.exr")), stmap)
+    before = tree(make(name, "once", words=words))
+    found, header, _ = read_warp(stmap)
+    found.warp[..., 0] += 3
+    write_warp(stmap, found, header, {})
+    after = tree(make(name, "once", "--resume", words=words))
+    assert after != before
+    assert after == tree(make(name, "anew", words=words))
+
+
+def test_resume_starts_anew_with_another_plane(make, shot, tree):
+    before = tree(make("scan", "once"))
+    words = replaced(shot.arguments("scan"), 3, PLANE.replace("31", "20"))
+    after = tree(make("scan", "once", "--resume", words=words))
+    assert after["lines.json"] != before["lines.json"]
+    assert after == tree(make("scan", "anew", words=words))
+
+
+def test_resume_starts_anew_with_another_source(make, shot, copied, tree):
+    copy = copied("scan2")
+    words = [*shot.arguments("warp"), "--source-scan", shot.scan1, "--source-scan", copy]
+    before = tree(make("warp", "once", words=words))
+    record = json.loads((copy / "lines.json").read_text())
+    for line in record["lines"]:
+        line["offset"] += 2
+    (copy / "lines.json").write_text(json.dumps(record))
+    after = tree(make("warp", "once", "--resume", words=words))
+    assert after["warp.exr"] != before["warp.exr"]
 
 
 @pytest.mark.parametrize(

@@ -34,11 +34,6 @@ class Plates:
     frames: NDArray[np.uint32] | None = None
     shadow_frames: NDArray[np.uint32] | None = None
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        return self.lit.shape[1], self.lit.shape[0]
-
 
 class ExtremePlates:
     """Running per-channel minimum and maximum of frames, Eq. (4), in constant memory.

@@ -212,7 +212,6 @@ class _Scene:
         frames = plates.frames if plates.shadow_frames is None else None
         never_shaded = shadow_beta.unknown_beta(contrast, frames)
         confidence = shadow_beta.confidence(contrast)
-        confidence[never_shaded] = 0
         contrasts = [contrast]
         if beta == "rgb":
             contrasts = list(np.moveaxis(shadow_beta.channel_contrast(plates, noise), -1, 0))

@@ -82,12 +82,14 @@ class Backdrop:
                     np.ascontiguousarray(colours[rows, ..., channel])
                     for colours in (image, self.lit)
                 )
-                slope = np.float32(self.noise.slope[channel])
-                floor = np.float32(self.noise.floor[channel])
                 off = value - lit
                 off *= off
                 np.maximum(value, 0, out=value)
-                off /= (slope + np.float32(_TOLERANCE**2) * value) * value + floor
+                variance = self.noise.channel_variance(value, channel)
+                value *= value
+                value *= np.float32(_TOLERANCE**2)
+                variance += value
+                off /= variance
                 total[rows] += off
         return total
 
@@ -111,12 +113,11 @@ class Backdrop:
                 np.ascontiguousarray(colours[..., channel])
                 for colours in (image, self.lit, self.shadow)
             )
-            slope, floor = (np.float32(v[channel]) for v in (self.noise.slope, self.noise.floor))
             above, span = value - shadow, lit - shadow
             np.maximum(value, 0, out=value)
             own = (np.float32(_TOLERANCE) * value) ** 2
             own += (self.doubt * np.minimum(value, shadow)) ** 2
-            weight = 1 / (value * slope + floor + own)
+            weight = 1 / (self.noise.channel_variance(value, channel) + own)
             square += weight * above**2
             from_lit2 += weight * (above - span) ** 2
             for direction, dot, length in zip((span, shadow), dots, lengths, strict=True):

@@ -54,8 +54,7 @@ class Weighed:
         """Args: as `line_distance`, but ``colours`` is (3, N)."""
         with np.errstate(invalid="ignore", over="ignore"):
             value = np.maximum(colours, 0)
-            sigma = value * noise.slope.astype(np.float32)[:, None]
-            sigma += noise.floor.astype(np.float32)[:, None]
+            sigma = np.stack([noise.channel_variance(value[c], c) for c in range(3)])
             np.sqrt(sigma, out=sigma)
             value *= np.float32(tolerance)
             sigma += value

@@ -167,9 +167,9 @@ def texture_evidence(image: Float32, backdrop: Backdrop) -> Float32:
     value = np.maximum(channel_sum(image), np.float32(1e-3))
     seen = np.log(value)
     known = np.log(np.maximum(channel_sum(backdrop.lit), np.float32(1e-3)))
-    noise = backdrop.noise
-    slope, floor = np.float32(noise.slope.mean()), np.float32(noise.floor.sum())
-    variance = (slope * value + floor) / value**2 + np.float32(_LEAST_TEXTURE**2)
+    each = np.asarray(value / 3, np.float32)
+    noise = [backdrop.noise.channel_variance(each, channel) for channel in range(3)]
+    variance = (noise[0] + noise[1] + noise[2]) / value**2 + np.float32(_LEAST_TEXTURE**2)
     evidence = np.zeros_like(value)
     for axis in (0, 1):
         here = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))

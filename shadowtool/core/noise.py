@@ -33,6 +33,9 @@ _LIGHT, _SHADE, _LEAST_TILES = 0.8, 0.6, 4
 # or after, penumbrae are what rare pixels are off by.
 _HALF_LIT, _FEW = 0.9, 0.06
 _LEVELS = 12
+# Of the variance at the darkest level that was measured this part is left at none; if that is
+# darker than this, nothing is to be guessed.
+_LEFT_IN_THE_DARK, _LEAST_LIGHT = 0.1, 1e-3
 _GRID = 10_000
 _SAMPLES = 8
 # Of frames far apart, this part of the pairs may be spoilt by something large that moved.
@@ -41,14 +44,22 @@ _FAR_QUANTILE = 0.25
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Variance = slope * value + floor, per channel, linear light.
+    """Variance = slope * value + floor, per channel, linear light; or what another such line says,
+    where that is less.
 
     Attributes:
         slope, floor: (3,) float64, non-negative.
+        dark: slope and floor of the other line, for what is darker than anything that was measured;
+            None for none.
     """
 
     slope: Float64
     floor: Float64
+    dark: tuple[Float64, Float64] | None = None
+
+    def record(self) -> list[list[float]]:
+        """All that it says, to tell it from another."""
+        return [[float(v) for v in row] for row in (self.slope, self.floor, *(self.dark or ()))]
 
     def sigma(self, image: NDArray[np.floating]) -> Float32:
         """Standard deviation of the noise at these values.
@@ -64,10 +75,21 @@ class NoiseModel:
 
     def variance(self, image: NDArray[np.floating]) -> Float32:
         """The square of `sigma`."""
-        variance: Float32 = np.maximum(image, 0, dtype=np.float32)
-        variance *= self.slope.astype(np.float32)
-        variance += self.floor.astype(np.float32)
-        return variance
+        value: Float32 = np.maximum(image, 0, dtype=np.float32)
+        return self._variance(value, slice(None))
+
+    def channel_variance(self, value: Float32, channel: int) -> Float32:
+        """The same of one channel's values, ≥ 0, of any shape."""
+        return self._variance(value, channel)
+
+    def _variance(self, value: Float32, channel: int | slice) -> Float32:
+        line, *others = (
+            value * slope[channel].astype(np.float32) + floor[channel].astype(np.float32)
+            for slope, floor in ((self.slope, self.floor), *([self.dark] if self.dark else []))
+        )
+        for other in others:
+            np.minimum(line, other, out=line)
+        return np.asarray(line, np.float32)
 
 
 @dataclass(frozen=True)
@@ -190,14 +212,16 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
 
 
 def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
-    """The line through the measured variances.
+    """The line through the measured variances, and below the darkest of them one that falls nearly
+    to 0 with the light: what photons and a codec's code values make of noise does so, and what the
+    first line makes of it in the dark, where nothing was measured, is a guess.
 
     Args:
         levels: from `noise_levels`; empty gives a model of ``least`` alone.
         least: noise that is always assumed, linear light: about what storing as half floats adds,
             and something to compare a rendering with.
     """
-    slope, floor = np.zeros(3), np.zeros(3)
+    slope, floor, darkest = np.zeros(3), np.zeros(3), np.zeros(3)
     for channel in range(3):
         own = [level for level in levels if level.channel == channel]
         if own:
@@ -209,9 +233,13 @@ def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
                 variances[i] = min(variances[i], float(np.median(variances[i + 1 :])))
             slope[channel], floor[channel] = _non_negative_line(values, variances)
             # In the dark, rounding counts most, and the line must not pass below it.
-            darkest = float(variances[0] - slope[channel] * values[0])
-            floor[channel] = max(floor[channel], darkest)
-    return NoiseModel(slope, np.maximum(floor, least**2))
+            floor[channel] = max(floor[channel], variances[0] - slope[channel] * values[0])
+            darkest[channel] = values[0]
+    floor = np.maximum(floor, least**2)
+    there, known = slope * darkest + floor, darkest > _LEAST_LIGHT
+    dark_floor = np.where(known, np.maximum(_LEFT_IN_THE_DARK * there, least**2), floor)
+    dark_slope = np.where(known, (there - dark_floor) / np.where(known, darkest, 1), slope)
+    return NoiseModel(slope, floor, (dark_slope, dark_floor))
 
 
 def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) -> list[Float64]:

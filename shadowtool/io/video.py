@@ -13,6 +13,7 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from shadowtool.core.chroma import chroma_at_luma
 from shadowtool.errors import DamagedFileError, InputError
 
 Float32 = NDArray[np.float32]
@@ -172,9 +173,8 @@ class Movie:
             green, blue, red = (plane / white for plane in planes)
             return np.stack([red, green, blue], axis=-1)
         luma = self._luma(planes[0], white)
-        height, width = luma.shape
         blue_difference, red_difference = (
-            self._chroma(_full_size(plane, width, height), white) for plane in planes[1:]
+            chroma_at_luma(self._chroma(plane, white), luma) for plane in planes[1:]
         )
         kr, kb = self._weights
         red = luma + np.float32(2 * (1 - kr)) * red_difference
@@ -232,19 +232,6 @@ def _subsampling(frame: av.VideoFrame) -> str:
     across = frame.format.chroma_width(64)
     down = frame.format.chroma_height(64)
     return {(64, 64): "444", (32, 64): "422", (64, 32): "440"}.get((across, down), "420")
-
-
-def _full_size(chroma: Float32, width: int, height: int) -> Float32:
-    """Chroma at luma's size: its samples lie on every second column, and between rows."""
-    if chroma.shape[1] != width:
-        wide = np.repeat(chroma, 2, axis=1)
-        wide[:, 1:-1:2] = (chroma[:, :-1] + chroma[:, 1:]) / 2
-        chroma = wide[:, :width]
-    if chroma.shape[0] != height:
-        double = (chroma.shape[1], 2 * chroma.shape[0])
-        tall = cv2.resize(np.ascontiguousarray(chroma), double, interpolation=cv2.INTER_LINEAR)
-        chroma = np.asarray(tall, np.float32)[:height]
-    return chroma
 
 
 def camera_frames(device: int, seconds: float) -> Iterator[MovieFrame]:

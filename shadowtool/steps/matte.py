@@ -143,7 +143,7 @@ def matte(
             "only": only,
             "steady": steady,
             "transfer": footage.transfer,
-            "noise": [[float(v) for v in row] for row in (noise.slope, noise.floor)],
+            "noise": noise.record(),
         },
         {"frames": Path(footage.sequence.pattern).name}
         | {"--plates": real(plates).name}

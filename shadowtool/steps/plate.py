@@ -144,7 +144,7 @@ def plate(
         shared = [marked.mark]
     parameters = {
         "estimator": estimator,
-        "read_as": read_as,
+        "read-as": read_as,
         "transfer": footage.transfer,
         "gain": gain if estimator == "robust" else "none",
         "steady": steady if estimator == "robust" else "none",

@@ -119,8 +119,22 @@ def passed_by(frames: int, error: float, noise: float, light: float) -> list[np.
 
 def test_what_a_codec_sends_anew_only_where_something_passed_is_off_by_as_much() -> None:
     model = model_of(passed_by(40, error=0.01, noise=0.0, light=0.0))
-    for value in (0.08, 0.3):
+    for value in (0.22, 0.3):
         assert model.sigma(np.full(3, value)) == pytest.approx([0.01] * 3, rel=0.25)
+
+
+def test_darker_than_all_that_was_measured_noise_falls_with_the_light() -> None:
+    rng = np.random.default_rng(3)
+    clean = rng.uniform(0.2, 0.5, (240, 320, 3))
+    model = model_of([clean + 0.01 * rng.normal(size=clean.shape) for _ in range(12)])
+    assert model.sigma(np.full(3, 0.4)) == pytest.approx([0.01] * 3, rel=0.1)
+    dark = model.variance(np.array([[0.1] * 3, [0.02] * 3, [0.0] * 3], np.float32))
+    for variance, part in zip(dark, (0.55, 0.19, 0.1), strict=True):
+        assert variance == pytest.approx([part * 1e-4] * 3, rel=0.3)
+    # What was measured in the dark stands.
+    clean = rng.uniform(0.01, 0.5, (240, 320, 3))
+    model = model_of([clean + 0.01 * rng.normal(size=clean.shape) for _ in range(12)])
+    assert model.sigma(np.full(3, 0.06)) == pytest.approx([0.01] * 3, rel=0.15)
 
 
 @pytest.mark.parametrize("light", [0.0, 0.15])

@@ -36,6 +36,11 @@ def test_a_shadow_that_moves_is_not_the_camera() -> None:
     assert shift(prepare(image), prepare(shaded), image.shape[1]) == pytest.approx(0, abs=0.05)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_another_picture_is_no_movement(seed: int) -> None:
+    assert shift(prepare(ground(seed)), prepare(ground(seed + 10)), 320) is None
+
+
 def test_a_picture_without_texture_tells_nothing() -> None:
     blank = np.full((100, 100), 0.5, np.float32)
     assert shift(prepare(blank), prepare(blank), 100) is None

@@ -188,6 +188,26 @@ def test_a_large_figure_in_one_colour_is_no_deep_shadow(sky: float) -> None:
     assert found == pytest.approx(ratio, rel=0.15)
 
 
+def test_a_surface_that_shade_makes_darker_than_others_is_background_too() -> None:
+    wall = (COLUMNS > 100) & (COLUMNS < 160) & (ROWS > 95)
+    grain = 0.7 * np.exp(0.4 * np.random.default_rng(0).normal(size=wall.shape))[..., None]
+    lit, shadow = grain * SCENE.lit, grain * SCENE.shadow
+    shadow[wall] *= 0.7
+    frames, betas = [], []
+    for number in range(FRAMES):
+        away = np.abs(COLUMNS - (-35 + 310 * number / (FRAMES - 1))) - 35
+        betas.append(np.where(ROWS > 88, np.clip(away / 2 + 0.5, 0, 1), 1.0))
+        image = shadow + betas[-1][..., None] * (lit - shadow)
+        frames.append(SCENE.noisy(image.astype(np.float32), number))
+    some = np.linspace(0, FRAMES - 1, SAMPLES).round().astype(int)
+    background = find_background([frames[i] for i in some], NOISE)
+    held = [
+        figure_mask(frame, background)[wall & (beta == 0)]
+        for frame, beta in zip(frames, betas, strict=True)
+    ]
+    assert np.concatenate(held).mean() < 0.1
+
+
 @pytest.mark.parametrize(
     ("soft", "sky"), [(2, 1.0), (16, 1.0), (20, 0.5), (2, 0.05), (2, 0.02), (2, 0.0), (12, 0.0)]
 )

@@ -95,6 +95,16 @@ def test_few_dark_frames_give_way_to_the_planes_ratio() -> None:
     assert take.error(found.shadow)[spot].max() < take.error(take.measured)[spot].min() / 2
 
 
+def test_noisy_dark_frames_lean_on_the_planes_ratio() -> None:
+    take = crossed(RATIO, band(), frames=3)
+    grain = np.random.default_rng(1).normal(0, 10 * SIGMA / np.sqrt(3), take.truth.shape)
+    measured = (take.measured + grain).astype(np.float32)
+    noise = NoiseModel(np.zeros(3), np.full(3, (10 * SIGMA) ** 2))
+    found = complete_shadow(take.lit, measured, take.frames, noise)
+    inside = take.reached == 0
+    assert take.error(found.shadow)[inside].mean() < 0.8 * take.error(measured)[inside].mean()
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_in_a_take_of_few_frames_the_few_tell(frames: int) -> None:
     take = crossed(RATIO, band(), frames=frames)

@@ -33,6 +33,12 @@ def test_a_camera_that_stands_still_does_not_tremble(noise: float) -> None:
     assert tremble([strips(shot) for shot in shots]) < 0.01
 
 
+@pytest.mark.parametrize("noise", [0.05, 0.1])
+def test_much_noise_is_no_trembling(noise: float) -> None:
+    shots, _ = trembling(0.0, noise)
+    assert tremble([strips(shot) for shot in shots]) < 0.03
+
+
 def test_where_nothing_tells_the_camera_stands_still() -> None:
     flat = np.full((30, 40), 0.5, np.float16)
     unknown = np.full((30, 40), np.nan, np.float16)

@@ -22,6 +22,9 @@ Bool = NDArray[np.bool_]
 
 # A hole of more than this part of the frame is no hole but a region that the shadow never reached.
 _LARGEST_HOLE = 0.005
+# Between these parts of the way from the darkest to the lightest around the figure, β continued
+# behind it is a penumbra.
+_PENUMBRA = 0.2, 0.6
 # Below this many standard deviations between L and S, β would be off by more than 0.1.
 _LEAST_CONTRAST = 10.0
 _WINDOW = 5
@@ -299,8 +302,9 @@ def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> F
 
     With ``lit`` they become 1. With ``inpaint`` small unknown patches and what the figure hides
     are continued from around them, and large regions that the shadow never
-    reached in the whole take become 1: nothing there is in shadow in this frame either. With
-    ``none`` they stay NaN.
+    reached in the whole take become 1: nothing there is in shadow in this frame either. Behind the
+    figure it is as light or as dark as around it but for a narrow penumbra, wherever that may lie:
+    not the even slope that continuing alone would make. With ``none`` they stay NaN.
 
     Args:
         beta: (H, W) float32 in [0, 1] or NaN.
@@ -321,7 +325,23 @@ def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> F
     # unknown; where it was set to 1 above it is as good as measured.
     np.copyto(filled, np.nan, where=hidden)
     _inpaint(filled)
+    box = around(hidden, _RING)
+    if box is not None:
+        _steepen(filled[box], hidden[box])
     return filled
+
+
+def _steepen(beta: Float32, hidden: Bool) -> None:
+    """Make a penumbra of the slope behind the figure, in place."""
+    size = np.ones((2 * _RING + 1,) * 2, np.uint8)
+    beside = (cv2.dilate(hidden.view(np.uint8), size) > 0) & ~hidden
+    if not beside.any():
+        return
+    darkest, lightest = (float(v) for v in np.quantile(beta[beside], (0.02, 0.98)))
+    low, high = (darkest + part * (lightest - darkest) for part in _PENUMBRA)
+    part = np.clip((beta - low) / np.float32(max(high - low, 1e-6)), 0, 1)
+    steep = darkest + (lightest - darkest) * part * part * (3 - 2 * part)
+    np.copyto(beta, steep.astype(np.float32), where=hidden)
 
 
 def inpaint(image: Float32) -> Float32:

@@ -125,6 +125,25 @@ def test_inpainting_continues_holes_and_lights_what_no_shadow_reached() -> None:
     assert np.array_equal(filled[known], beta[known])
 
 
+def test_behind_the_figure_light_meets_shadow_in_a_narrow_penumbra() -> None:
+    """A shadow that begins at the feet, at the lower end of what is hidden."""
+    beta = np.ones((90, 60), np.float32)
+    beta[76:, 20:] = 0
+    hidden = np.zeros(beta.shape, bool)
+    hidden[10:80, 22:38] = True
+    beta[hidden] = np.nan
+    filled = fill_beta(beta, np.zeros_like(hidden), hidden, "inpaint")
+    behind = filled[hidden]
+    between = (behind > 0.05) & (behind < 0.95)
+    plain = inpaint(beta)[hidden]
+    assert between.mean() < 0.6 * ((plain > 0.05) & (plain < 0.95)).mean()
+    assert (filled[:60, 22:38] > 0.99).all() and filled[79, 30] < 0.1
+    # In even half-shade it is no lighter and no darker.
+    beta[~hidden] = 0.3
+    even = fill_beta(beta, np.zeros_like(hidden), hidden, "inpaint")
+    assert even == pytest.approx(0.3, abs=0.01)
+
+
 def test_inpainting_stays_in_range_and_knows_nothing_as_lit() -> None:
     rng = np.random.default_rng(0)
     image = rng.uniform(0, 1, (30, 30)).astype(np.float32)

@@ -35,7 +35,7 @@ _HALF_LIT, _FEW = 0.9, 0.06
 _LEVELS = 12
 # Of the variance at the darkest level that was measured this part is left at none; if that is
 # darker than this, nothing is to be guessed.
-_LEFT_IN_THE_DARK, _LEAST_LIGHT = 0.1, 1e-3
+_LEFT_IN_THE_DARK, _LEAST_LIGHT = 0.35, 1e-3
 _GRID = 10_000
 _SAMPLES = 8
 # Of frames far apart, this part of the pairs may be spoilt by something large that moved.
@@ -212,9 +212,9 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
 
 
 def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
-    """The line through the measured variances, and below the darkest of them one that falls nearly
-    to 0 with the light: what photons and a codec's code values make of noise does so, and what the
-    first line makes of it in the dark, where nothing was measured, is a guess.
+    """The line through the measured variances, and below the darkest of them one that falls by more
+    with the light: what photons and a codec's code values make of noise falls to nothing, and what
+    the first line makes of it in the dark, where nothing was measured, is a guess.
 
     Args:
         levels: from `noise_levels`; empty gives a model of ``least`` alone.

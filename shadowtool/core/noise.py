@@ -197,7 +197,7 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
         for channel in range(3)
         for level in range(_LEVELS)
     ]
-    model = noise_model(levels)
+    model = replace(noise_model(levels), dark=None)
     times = np.maximum(
         _heaviness(compared, share, model), _renewal([samples[a] for a in firsts], model)
     )

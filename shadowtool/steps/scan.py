@@ -137,8 +137,10 @@ def scan(
     reading = _crossings(footage, frames, gain, run)
     trembling = reading.trembling
     if steady == "auto" and trembling > UNSTEADY:
-        footage = footage.steadied(reading.sampled, run.jobs)
-        reading = _crossings(footage, list(reading.gains), gain, run)
+        footage, readable = footage.steadied(reading.sampled, run.jobs), list(reading.gains)
+        # There is no room for both readings.
+        del reading
+        reading = _crossings(footage, readable, gain, run)
     crossings, noise, remaining, marks, gains, bad, first, _ = reading
     del reading
     warn_of_nan(output, bad)

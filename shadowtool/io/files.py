@@ -185,6 +185,14 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def leads_nowhere(path: Path) -> bool:
+    """Whether it is a link to what isn't there."""
+    try:
+        return path.is_symlink() and not path.exists()
+    except OSError:
+        return False
+
+
 @contextlib.contextmanager
 def new_folders(paths: Iterable[Path], shared: bool = False) -> Iterator[None]:
     """Make output folders; if what follows fails, those that are new and still empty go again.

@@ -17,7 +17,7 @@ from fileseq.frameset import FrameSet
 
 from shadowtool.choices import Missing
 from shadowtool.errors import InputError, OptionError
-from shadowtool.io.files import is_file, real
+from shadowtool.io.files import is_file, leads_nowhere, real
 from shadowtool.io.image import EXR, PNG
 
 Frame = int | Decimal
@@ -36,11 +36,13 @@ class Sequence:
         name: the part of the files' names before the number, without its separator.
         pattern: how a person would write it, for messages and records.
         files: path by frame number, ascending.
+        gone: frames of which there is no more than a link to nothing.
     """
 
     name: str
     pattern: str
     files: dict[Frame, Path]
+    gone: tuple[Frame, ...] = ()
 
     @property
     def frames(self) -> tuple[Frame, ...]:
@@ -102,7 +104,7 @@ class Sequence:
             OptionError: the range can't be read.
         """
         if frames is None:
-            wanted: Iterable[Frame] = sorted({*self.files, *self.gaps()})
+            wanted: Iterable[Frame] = sorted({*self.files, *self.gaps(), *self.gone})
         else:
             wanted = parse_frames(frames)
         present = [frame for frame in wanted if frame in self.files]
@@ -215,11 +217,12 @@ class _Found(NamedTuple):
 
 
 def _sequences(folder: Path) -> list[_Found]:
-    names = sorted(
-        path.name
+    pictures = [
+        path
         for path in folder.iterdir()
-        if not path.name.startswith(".") and path.suffix.lower() in (EXR, PNG) and is_file(path)
-    )
+        if not path.name.startswith(".") and path.suffix.lower() in (EXR, PNG)
+    ]
+    names = sorted(path.name for path in pictures if is_file(path) or leads_nowhere(path))
     try:
         found = findSequencesInList(names)
         numbered = [s for s in found if s.frameSet()]
@@ -246,12 +249,15 @@ def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
     if not frame_set:
         path = folder / str(sequence)
         return _Found(_single(path), base, suffix, digits=0)
-    frames = sorted(_frames(frame_set))
-    files = {frame: folder / sequence.frame(frame) for frame in frames}
+    places = {frame: folder / sequence.frame(frame) for frame in sorted(_frames(frame_set))}
+    gone = tuple(frame for frame, path in places.items() if leads_nowhere(path))
+    files = {frame: path for frame, path in places.items() if frame not in gone}
     digits = max(sequence.zfill(), 1)
     name = base.rstrip("._- ") or real(folder).name
     pattern = os.fspath(folder / f"{base}{'#' * digits}{suffix}")
-    return _Found(Sequence(name, pattern, files), base, suffix, digits)
+    if not files:
+        raise InputError(f"{pattern}: links that lead nowhere; restore what they lead to")
+    return _Found(Sequence(name, pattern, files, gone), base, suffix, digits)
 
 
 def _single(path: Path) -> Sequence:

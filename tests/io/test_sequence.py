@@ -303,6 +303,25 @@ def test_a_folder_linked_into_itself_is_read_once(folder):
     assert len(open_sequence(place)) == len(open_sequence(place / "again/again")) == 4
 
 
+def test_a_frame_that_is_a_link_to_nothing_is_missing(folder):
+    place = folder(*take())
+    last = max(open_sequence(place).files)
+    path = open_sequence(place).path(last)
+    path.unlink()
+    path.symlink_to(place / "evicted.exr")
+    sequence = open_sequence(place)
+    assert sequence.gone == (last,)
+    with pytest.raises(InputError, match=f"missing frames {last}"):
+        sequence.select(None)
+    present, absent = sequence.select(None, "skip")
+    assert len(present) == 3 and absent == [last]
+    for path in sequence.files.values():
+        path.unlink()
+        path.symlink_to(place / "evicted.exr")
+    with pytest.raises(InputError, match="lead nowhere"):
+        open_sequence(place)
+
+
 def test_frames_may_be_links(folder, tmp_path):
     store = folder("blob")
     place = tmp_path / "links"

@@ -31,8 +31,7 @@ from shadowtool.cli.options import gain_option, steady_option, step_command, tra
 @click.option(
     "--plane",
     metavar="IMAGE|POLYGON",
-    help="The plane that the shadow falls on, as for scan. Default: all of the picture if the"
-    " shadow reached less than most of it.",
+    help="The plane that the shadow falls on, as for scan. Default: as --read-as says.",
 )
 @click.option(
     "--read-as",

@@ -23,8 +23,9 @@ Bool = NDArray[np.bool_]
 # A hole of more than this part of the frame is no hole but a region that the shadow never reached.
 _LARGEST_HOLE = 0.005
 # Between these parts of the way from the darkest to the lightest around the figure, β continued
-# behind it is a penumbra.
-_PENUMBRA = 0.2, 0.6
+# behind it is a penumbra; where these differ by more than the next, and where penumbrae that are so
+# near, pixels, are narrower than the figure by this factor; of twice that it is one altogether.
+_PENUMBRA, _EVEN, _NEARBY, _NARROWER = (0.2, 0.6), 0.1, 12, 2.0
 # Below this many standard deviations between L and S, β would be off by more than 0.1.
 _LEAST_CONTRAST = 10.0
 _WINDOW = 5
@@ -325,23 +326,42 @@ def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> F
     # unknown; where it was set to 1 above it is as good as measured.
     np.copyto(filled, np.nan, where=hidden)
     _inpaint(filled)
-    box = around(hidden, _RING)
-    if box is not None:
-        _steepen(filled[box], hidden[box])
+    _steepen(filled, hidden)
     return filled
 
 
 def _steepen(beta: Float32, hidden: Bool) -> None:
-    """Make a penumbra of the slope behind the figure, in place."""
-    size = np.ones((2 * _RING + 1,) * 2, np.uint8)
-    beside = (cv2.dilate(hidden.view(np.uint8), size) > 0) & ~hidden
-    if not beside.any():
+    """Make a penumbra of the slope behind each part of the figure, in place, as far as penumbrae
+    around it are narrower than the part."""
+    box = around(hidden, _NEARBY)
+    if box is None:
         return
-    darkest, lightest = (float(v) for v in np.quantile(beta[beside], (0.02, 0.98)))
-    low, high = (darkest + part * (lightest - darkest) for part in _PENUMBRA)
-    part = np.clip((beta - low) / np.float32(max(high - low, 1e-6)), 0, 1)
-    steep = darkest + (lightest - darkest) * part * part * (3 - 2 * part)
-    np.copyto(beta, steep.astype(np.float32), where=hidden)
+    whole, parts = beta[box], cv2.connectedComponents(hidden[box].view(np.uint8))
+    # How wide a penumbra is tells its steepest slope.
+    seen = np.where(hidden[box], np.float32(np.nan), whole)
+    across, down = (np.abs(np.diff(seen, axis=axis, prepend=np.nan)) for axis in (1, 0))
+    slope = np.fmax(across, down)
+    for part in range(1, parts[0]):
+        own = around(parts[1] == part, _NEARBY)
+        assert own is not None
+        inside = (parts[1][own] == part).view(np.uint8)
+        wide = 2 * float(cv2.distanceTransform(np.pad(inside, 1), cv2.DIST_L2, 3).max())
+        near = cv2.dilate(inside, np.ones((2 * _NEARBY + 1,) * 2, np.uint8)) > 0
+        beside = (cv2.dilate(inside, np.ones((2 * _RING + 1,) * 2, np.uint8)) > 0) & (inside == 0)
+        around_it, steepest = whole[own][beside], slope[own][near]
+        steepest = steepest[np.isfinite(steepest)]
+        if not around_it.size or not steepest.size:
+            continue
+        darkest, lightest = (float(v) for v in np.quantile(around_it, (0.02, 0.98)))
+        if lightest - darkest < _EVEN:
+            continue
+        narrow = float(steepest.max()) / (lightest - darkest) * wide
+        low, high = (darkest + place * (lightest - darkest) for place in _PENUMBRA)
+        place = np.clip((whole[own] - low) / np.float32(high - low), 0, 1)
+        steep = darkest + (lightest - darkest) * place * place * (3 - 2 * place)
+        share = np.float32(np.clip(narrow / _NARROWER - 1, 0, 1))
+        steep = share * steep + (1 - share) * whole[own]
+        np.copyto(whole[own], steep.astype(np.float32), where=inside > 0)
 
 
 def inpaint(image: Float32) -> Float32:

@@ -32,6 +32,9 @@ _SMALLER, _STEPS, _ARRIVED = (4, 2, 1), 5, 0.002
 _OUT, _ONE_WAY = 4.7, 0.01
 # The standard error of a median, times the square root of their number, in median deviations.
 _MEDIAN_ERROR = 1.48 * 1.25
+# A camera moves so many of the tiles alike, give or take this, pixels, or this part of it: what
+# moves fewer of them moved in front of it.
+_CAMERA, _TOGETHER, _PART = 2 / 3, 0.15, 0.5
 # Nearer to each other than this, pixels, two places are one.
 _SAME = 0.01
 # Lobes of the kernel that a moved picture is interpolated by; by what part of it the least and the
@@ -80,10 +83,11 @@ def shift(reference: Float32, other: Float32, width: int) -> float | None:
 
 class _Displacement(NamedTuple):
     """Where one prepared picture shows what another does, other(p + place) = reference(p), and the
-    standard error of that; (x, y) in pixels, (2,) each."""
+    standard error of that; (x, y) in pixels, (2,) each; and what part of the tiles say so."""
 
     place: Float64
     error: Float64
+    share: float
 
 
 def _displacement(reference: Float32, other: Float32) -> _Displacement | None:
@@ -97,14 +101,20 @@ def _displacement(reference: Float32, other: Float32) -> _Displacement | None:
         for _ in range(_STEPS):
             x, y = (place / smaller).tolist()
             agreed, others = _steps(one, displaced(two, (x, y)))
-            step = np.median(agreed if len(agreed) else others, axis=0) * smaller
-            place = place + step
-            if np.abs(step).max() < _ARRIVED:
+            step = np.median(agreed if len(agreed) else others, axis=0)
+            # What repeats itself is not to be followed from one period to the next.
+            place = place + np.clip(step, -1, 1) * smaller
+            if np.abs(step).max() * smaller < _ARRIVED:
                 break
+        if smaller > 1 and len(agreed) < len(others):
+            place = np.zeros(2)
     if not len(agreed):
         return None
-    deviation = np.median(np.abs(agreed - np.median(agreed, axis=0)), axis=0)
-    return _Displacement(place, _MEDIAN_ERROR * deviation / np.sqrt(len(agreed)))
+    off = np.abs(agreed - np.median(agreed, axis=0))
+    together = max(_TOGETHER, _PART * float(np.abs(place).max()))
+    share = float((off.max(axis=1) < together).mean())
+    error = _MEDIAN_ERROR * np.median(off, axis=0) / np.sqrt(len(agreed))
+    return _Displacement(place, error, share)
 
 
 def _smaller(picture: Float32, times: int) -> Float32:
@@ -169,13 +179,17 @@ class Vantage:
     @classmethod
     def of(cls, image: NDArray[np.floating]) -> "Vantage":
         """That of an image (H, W) or (H, W, 3), linear light; not finite unknown."""
-        return cls(_prepared(image), image.shape[1])
+        return cls(prepared(image), image.shape[1])
 
     def off(self, image: NDArray[np.floating]) -> Place:
         """Where an image, as of `of`, shows what is seen from here: displaced by (x, y), pixels;
-        (0, 0) if it is next to that, or shows too little to tell."""
-        found = _displacement(self.picture, _prepared(image))
-        if found is None:
+        (0, 0) if it is next to that, or shows too little to tell, or not all of it moved alike."""
+        return self.off_prepared(prepared(image))
+
+    def off_prepared(self, picture: Float32) -> Place:
+        """The same of an image that was `prepared`."""
+        found = _displacement(self.picture, picture)
+        if found is None or found.share < _CAMERA:
             return 0.0, 0.0
         # Sums come out otherwise in their last digits on other processors.
         place = found.place * self.width / self.picture.shape[1] - self.place
@@ -190,7 +204,8 @@ class Vantage:
         return Vantage(self.picture, self.width, (x, y))
 
 
-def _prepared(image: NDArray[np.floating]) -> Float32:
+def prepared(image: NDArray[np.floating]) -> Float32:
+    """`prepare` of an image (H, W) or (H, W, 3), linear light."""
     values = to_float(image)
     return prepare(values if values.ndim == 2 else channel_sum(values) / np.float32(3))
 
@@ -199,7 +214,8 @@ def displaced(image: NDArray[np.floating], place: Place) -> NDArray[np.floating]
     """The image as it is seen from another place, image(p + place) at p; the same array if that is
     (0, 0).
 
-    Interpolated by Lanczos' kernel, and kept between the least and the most of the pixels around.
+    Interpolated by Lanczos' kernel, and kept within half of the least and of the most of the pixels
+    around.
     What isn't finite stays where it is, and what is near it, too. Beyond the frame's edge the
     picture is taken to go on as it ends there.
 

@@ -24,7 +24,7 @@ def chroma_at_luma(chroma: Float32, luma: Float32) -> Float32:
         luma: (H, W), from 0 to 1.
 
     Returns:
-        (H, W) float32; means over as many pixels as a sample stands for are those of the samples.
+        (H, W) float32.
     """
     if chroma.shape == luma.shape:
         return chroma

@@ -66,13 +66,18 @@ def diffuse(
 def _open_to_the_edge(unknown: Bool) -> Bool:
     """The unknown parts that the frame's edge cuts off."""
     size = np.ones((_NARROW, _NARROW), np.uint8)
-    # Beyond the edge all is unknown.
-    outside = np.pad(unknown.view(np.uint8), _NARROW, constant_values=1)
-    wide = np.asarray(cv2.morphologyEx(outside, cv2.MORPH_OPEN, size), np.uint8)
-    _, labels = cv2.connectedComponents(wide, connectivity=4)
-    reached = cv2.dilate((labels == labels[0, 0]).view(np.uint8), size)
     inner = slice(_NARROW, -_NARROW)
-    return np.asarray((reached[inner, inner] > 0) & unknown)
+    # The picture goes on as it ends.
+    around = np.pad(unknown.view(np.uint8), _NARROW, mode="edge")
+    wide = np.asarray(cv2.morphologyEx(around, cv2.MORPH_OPEN, size), np.uint8)
+    count, labels = cv2.connectedComponents(wide, connectivity=4)
+    own = labels[inner, inner]
+    cut = np.zeros(count, bool)
+    for edge in (own[0], own[-1], own[:, 0], own[:, -1]):
+        cut[edge] = True
+    cut[0] = False
+    reached = cv2.dilate(cut[labels].view(np.uint8), size)[inner, inner]
+    return np.asarray((reached > 0) & unknown)
 
 
 def _diffused(

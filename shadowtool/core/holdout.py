@@ -42,9 +42,10 @@ _SCATTER, _LOWERED = 0.03, 2.0
 # than the next, and so much at once, is that of a card waved over a scene.
 _SHADED, _MOST, _AT_ONCE = 0.5, 0.5, 0.2
 # So is one in which it darkens as much of both as this, a geometric mean, and nobody is seen: 0.1
-# at most is usual of somebody's shadow, and 0.2 and more of a card's. Somebody is brighter than lit
-# ground, by this part, in more than the last part of the picture.
-_LARGE, _BRIGHTER, _SOMEBODY = 0.14, 0.1, 0.002
+# is usual of somebody's shadow, 0.15 of somebody in black near to the camera, and 0.2 and more of a
+# card's. Somebody is brighter than lit ground, by this part, in more than the last part of the
+# picture.
+_LARGE, _BRIGHTER, _SOMEBODY = 0.17, 0.1, 0.002
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
 # Decided pixels are dropped when no more than this part is left.

@@ -237,7 +237,10 @@ def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:
             darkest[channel] = values[0]
     floor = np.maximum(floor, least**2)
     there, known = slope * darkest + floor, darkest > _LEAST_LIGHT
-    dark_floor = np.where(known, np.maximum(_LEFT_IN_THE_DARK * there, least**2), floor)
+    dark_floor = np.maximum(_LEFT_IN_THE_DARK * there, least**2)
+    # A line that falls by as much already stands.
+    known &= dark_floor < floor
+    dark_floor = np.where(known, dark_floor, floor)
     dark_slope = np.where(known, (there - dark_floor) / np.where(known, darkest, 1), slope)
     return NoiseModel(slope, floor, (dark_slope, dark_floor))
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Missing
-from shadowtool.core.camera_motion import Place, Vantage, displaced
+from shadowtool.core.camera_motion import Place, Vantage, displaced, prepared
 from shadowtool.core.noise import (
     NoiseModel,
     noise_levels,
@@ -18,7 +18,7 @@ from shadowtool.core.noise import (
     sample_positions,
     thin,
 )
-from shadowtool.core.trembling import strips
+from shadowtool.core.trembling import UNSTEADY, strips
 from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
 from shadowtool.io.products import StoredPlates
@@ -82,10 +82,17 @@ class Footage:
 
     def steadied(self, frames: list[Frame], jobs: int | None = None) -> "Footage":
         """The same take seen from one place, the middle of those that these frames, all of which
-        can be read, are seen from."""
-        vantage = Vantage.of(self.read(frames[0]))
-        places = ordered_map(lambda frame: vantage.off(self.read(frame)), frames, jobs)
-        return replace(self, vantage=vantage.amid(list(places)))
+        can be read, are seen from; as it is if they are all seen from one.
+
+        What most of them show stands for the scene, lest somebody in front of it be followed.
+        """
+        pictures = list(ordered_map(lambda frame: prepared(self.read(frame)), frames, jobs))
+        usual = np.asarray(np.median(pictures, axis=0), np.float32)
+        vantage = Vantage(usual, self.header.width)
+        places = [vantage.off_prepared(picture) for picture in pictures]
+        if np.std(places, axis=0).mean() < UNSTEADY:
+            return self
+        return replace(self, vantage=vantage.amid(places))
 
     def survey(self, jobs: int | None = None) -> Survey:
         """What frames spread over the whole take tell; it does not depend on which of them a run

@@ -126,11 +126,6 @@ def matte(
     noise, rows = footage.survey(run.jobs)
     off = off_place(strips(stored.plates.lit[..., 1]), rows) if steady == "auto" else 0.0
     if off > UNSTEADY:
-        logger.warning(
-            "%s: the camera is off the plates' place by %.2f pixels; frames are moved there",
-            footage.sequence.pattern,
-            off,
-        )
         footage = replace(footage, vantage=Vantage.of(stored.plates.lit))
         noise = footage.survey(run.jobs).noise
     recipe = Recipe(
@@ -169,6 +164,13 @@ def matte(
     del stored
     work = FrameWork(recipe, output, take.products, take.sources, shared, take.make, take.others)
     result = work.run(frames, run, absent, take.summary)
+    if (moved := result.figures.get("moved", 0)) > 0:
+        logger.warning(
+            "%s: the camera trembles, or is not where the plates were taken from; frames are moved"
+            " there, by up to %.2f pixels",
+            footage.sequence.pattern,
+            moved,
+        )
     if result.figures.get("hidden", 0) > _TOO_MUCH:
         logger.warning(
             "%s: %.0f%% of the picture is taken for the figure; are these the plates of this take?",
@@ -371,7 +373,8 @@ class _Take:
 
     def _figure(self, frame: Frame, shown: _Shown) -> _Figure:
         if self.alpha is not None:
-            matte = displaced(_matte_plane(self.alpha.path(frame)), shown.moved).astype(np.float32)
+            matte = np.clip(displaced(_matte_plane(self.alpha.path(frame)), shown.moved), 0, 1)
+            matte = matte.astype(np.float32, copy=False)
             box = around(matte > 0, MARGIN) or _NONE
             alpha, image = matte[box].copy(), shown.at(box)
             backdrop, unknown = self.scene.backdrop.at(box), self.scene.unknown[box]

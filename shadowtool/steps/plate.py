@@ -229,7 +229,7 @@ def plate(
                 "%s: the camera trembles by %.2f pixels; %s",
                 footage.sequence.pattern,
                 take.trembling,
-                "plates are off where texture is strong"
+                "plates are off where texture is strong; hold it firmly, or give --steady auto"
                 if take.footage.vantage is None
                 else "frames are moved to one place",
             )
@@ -238,7 +238,7 @@ def plate(
     elif figures.get("read_as") == UNDER_A_CARD and figures["shaded"] < _WELL_SHADED:
         logger.warning(
             "%s: %.0f%% of the picture never got darker; it is in shade already, or the card's full"
-            " shadow was never there",
+            " shadow was never there; if it was no card's, give --read-as plane",
             footage.sequence.pattern,
             100 * (1 - figures["shaded"]),
         )
@@ -475,14 +475,21 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     if take.footage.vantage is None:
         take.trembling = tremble(rows)
         if take.steady and take.trembling > UNSTEADY:
-            take.kept.clear()
-            take.footage = take.footage.steadied(apart, take.run.jobs)
-            return _sample(take, frames, automatic, with_levels)
+            moved = take.footage.steadied(apart, take.run.jobs)
+            if moved.vantage is not None:
+                # What is known of the frames as they were makes room for what they become.
+                for known in (take.kept, thinned, grids, grays):
+                    known.clear()
+                take.footage = moved
+                return _sample(take, frames, automatic, with_levels)
+            # Somebody large moved, not the camera.
+            take.trembling = 0.0
     if take.level and apart:
         take.reference = common_reference([take.sparse(grids[frame]) for frame in apart])
     gains = {frame: take.gain(frame, grid) for frame, grid in grids.items()}
     take.known_gains = gains
-    if apart and (automatic or (with_levels and take.card is None)):
+    # Where a figure is held out by what was given it is a source.
+    if apart and take.held is None and take.card is not True:
         level = [grids[frame] / np.float32(gains[frame]) for frame in apart]
         background = find_background(level, noise)
         if take.card is None and background.under_card:

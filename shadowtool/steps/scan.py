@@ -138,9 +138,10 @@ def scan(
     trembling = reading.trembling
     if steady == "auto" and trembling > UNSTEADY:
         footage, readable = footage.steadied(reading.sampled, run.jobs), list(reading.gains)
-        # There is no room for both readings.
-        del reading
-        reading = _crossings(footage, readable, gain, run)
+        if footage.vantage is not None:
+            # There is no room for both readings.
+            del reading
+            reading = _crossings(footage, readable, gain, run)
     crossings, noise, remaining, marks, gains, bad, first, _ = reading
     del reading
     warn_of_nan(output, bad)
@@ -420,7 +421,7 @@ def _advise(figures: Figures, footage: Footage) -> None:
             "%s: the camera trembles by %.2f pixels; %s",
             take,
             figures["trembling"],
-            "objects are less well known"
+            "objects are less well known; hold it firmly, or give --steady auto"
             if footage.vantage is None
             else "frames are moved to one place",
         )
@@ -434,7 +435,7 @@ def _advise(figures: Figures, footage: Footage) -> None:
     if figures["beyond_lines"] > _BEYOND:
         logger.warning(
             "%s: the shadow reached %.0f%% of what it did before or after it crossed the plane, and"
-            " W is unknown there; mark a larger plane, or sweep across it",
+            " tells nothing there; mark a larger plane, or sweep across it",
             take,
             100 * figures["beyond_lines"],
         )

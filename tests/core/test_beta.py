@@ -138,6 +138,12 @@ def test_behind_the_figure_light_meets_shadow_in_a_narrow_penumbra() -> None:
     plain = inpaint(beta)[hidden]
     assert between.mean() < 0.6 * ((plain > 0.05) & (plain < 0.95)).mean()
     assert (filled[:60, 22:38] > 0.99).all() and filled[79, 30] < 0.1
+    # A penumbra as wide as the figure goes on behind it as it is around it.
+    soft = np.tile(np.linspace(0, 1, 60, dtype=np.float32), (90, 1))
+    soft[hidden] = np.nan
+    assert np.array_equal(
+        fill_beta(soft, np.zeros_like(hidden), hidden, "inpaint")[hidden], inpaint(soft)[hidden]
+    )
     # In even half-shade it is no lighter and no darker.
     beta[~hidden] = 0.3
     even = fill_beta(beta, np.zeros_like(hidden), hidden, "inpaint")

@@ -85,6 +85,17 @@ def test_frames_that_are_in_place_are_left_alone() -> None:
     assert displaced(image, (0.0, 0.0)) is image
 
 
+@pytest.mark.parametrize("period", [4.0, 6.0, 9.0])
+def test_what_repeats_itself_is_not_followed_to_the_next_period(period: float) -> None:
+    columns = np.arange(320.0)
+    stripes = 0.5 + 0.3 * np.sin(2 * np.pi * columns / period)
+    moved = 0.5 + 0.3 * np.sin(2 * np.pi * (columns - 0.2) / period)
+    faint = 0.02 * waves(0, 0)
+    one, other = (np.tile(s, (240, 1)) + faint for s in (stripes, moved))
+    found = Vantage.of(one.astype(np.float32)).off(other.astype(np.float32))
+    assert np.abs(found).max() < 0.5 * period
+
+
 def test_a_vantage_amid_places_is_where_most_of_them_are() -> None:
     places = [(0.1, 0.0), (0.3, -0.2), (0.2, -0.1)]
     amid = Vantage.of(waves(0, 0)).amid(places)

@@ -60,6 +60,15 @@ def test_where_no_sweep_went_is_the_plane_and_a_hole_is_what_is_around_it() -> N
     assert np.linalg.norm(on[SCENE.rows[0], 75]) > 3
 
 
+def test_a_lone_pixel_at_the_frames_edge_is_no_place_where_no_sweep_went() -> None:
+    identity = identity_map(40, 60)
+    warp, error = identity + np.float32([9, 0]), np.full((40, 60), 0.1, np.float32)
+    unknown = np.random.default_rng(0).random((40, 60)) < 0.03
+    warp[unknown], error[unknown] = np.nan, np.inf
+    filled = diffuse(WarpMap(warp, error), iterations=0, plane_beyond=True).warp
+    assert filled == pytest.approx(identity + np.float32([9, 0]), abs=0.1)
+
+
 def test_what_is_well_known_is_not_moved_by_what_is_not() -> None:
     known = noisy_map(0.0, 0.05)
     warp, error = known.warp.copy(), known.error.copy()

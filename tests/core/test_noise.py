@@ -131,6 +131,11 @@ def test_darker_than_all_that_was_measured_noise_falls_with_the_light() -> None:
     dark = model.variance(np.array([[0.1] * 3, [0.02] * 3, [0.0] * 3], np.float32))
     for variance, part in zip(dark, (0.67, 0.42, 0.35), strict=True):
         assert variance == pytest.approx([part * 1e-4] * 3, rel=0.3)
+    # Noise that falls by itself with the light, as photons' does, stands in light and dark.
+    photons = [clean + np.sqrt(4e-4 * clean) * rng.normal(size=clean.shape) for _ in range(12)]
+    for value in (1.0, 0.3, 0.05):
+        found = model_of(photons).variance(np.full(3, value))
+        assert found == pytest.approx([4e-4 * value] * 3, rel=0.3)
     # What was measured in the dark stands.
     clean = rng.uniform(0.01, 0.5, (240, 320, 3))
     model = model_of([clean + 0.01 * rng.normal(size=clean.shape) for _ in range(12)])

@@ -41,7 +41,7 @@ from shadowtool.cli.options import gain_option, steady_option, step_command, tra
     help="plane: a shadow crossed a plane, as in a source, and what it didn't reach would be as"
     " dark as the rest. card: a card was waved over a scene, as in a target, and what never got"
     " darker is in shade already. auto: by how much got dark, altogether and at once, and whether"
-    " anybody is seen.",
+    " what is dark looks like somebody.",
 )
 @gain_option
 @steady_option

@@ -41,11 +41,12 @@ _SCATTER, _LOWERED = 0.03, 2.0
 # Less than this part of its light is darkened. A take in which a shadow darkens more of the picture
 # than the next, and so much at once, is that of a card waved over a scene.
 _SHADED, _MOST, _AT_ONCE = 0.5, 0.5, 0.2
-# So is one in which it darkens as much of both as this, a geometric mean, and nobody is seen: 0.1
-# is usual of somebody's shadow, 0.15 of somebody in black near to the camera, and 0.2 and more of a
-# card's. Somebody is brighter than lit ground, by this part, in more than the last part of the
-# picture.
-_LARGE, _BRIGHTER, _SOMEBODY = 0.17, 0.1, 0.002
+# So is one in which it darkens as much of both, a geometric mean, as the first of these, and more
+# by so many times of what tells of somebody: what is brighter than lit ground, by a part, counted
+# so many times; and in dark clothes what is darkened off the line differs from frame to frame by
+# more than a factor.
+_LARGE, _SOMEBODY = 0.09, 0.6
+_BRIGHTER, _COUNTED, _DIFFERS = 0.1, 7.0, 1.35
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
 # Decided pixels are dropped when no more than this part is left.
@@ -264,23 +265,36 @@ def _under_a_card(stack: Float32, on_line: list[Bool], lit: Float32) -> bool:
     """Whether a shadow came over much of the picture, twice at least, and over much of it at once.
 
     What is dark may be clothes, and is shadow for certain where the common ratio says so, but not
-    all of a scene has the same: both count. Whoever casts a shadow in a source is seen in it, and
-    hardly anybody is nowhere brighter than the ground.
+    all of a scene has the same: both count. A surface that has another ratio is darkened to the
+    same each time, and only to that; where a figure passes, what is dark off the line is now this
+    and now that, and its shadow, which is on the line, falls there, too. And hardly anything but a
+    figure is brighter than lit ground.
     """
-    dark, shaded = (np.zeros(lit.shape[1], np.int32) for _ in range(2))
+    light = lit.sum(axis=0)
+    dark, shaded, others = (np.zeros(light.size, np.int32) for _ in range(3))
+    least, most = np.full(light.size, np.inf, np.float32), np.zeros(light.size, np.float32)
     at_once, brighter = np.zeros((len(stack), 2)), 0.0
     for sample, lies, parts in zip(stack, on_line, at_once, strict=True):
-        now = sample.sum(axis=0) < _SHADED * lit.sum(axis=0)
+        value = sample.sum(axis=0)
+        now = value < _SHADED * light
         dark += now
         shaded += now & lies
         parts[:] = now.mean(), (now & lies).mean()
+        off = now & ~lies
+        others += off
+        np.minimum(least, value, out=least, where=off)
+        np.maximum(most, value, out=most, where=off)
         above = (sample > (1 + _BRIGHTER) * lit + _TOLERANCE).any(axis=0)
         brighter += float((above & ~lies).mean()) / len(stack)
     altogether = [float((often >= 2).mean()) for often in (dark, shaded)]
     widest = at_once.max(axis=0)
     if altogether[1] > _MOST or (altogether[0] > _MOST and widest[0] > _AT_ONCE):
         return True
-    return math.prod((*altogether, *widest)) > _LARGE**4 and brighter < _SOMEBODY
+    differs = (others >= 2) & (most > _DIFFERS * least)
+    both = (others > 0) & (shaded > 0)
+    somebody = float(differs.mean() + both.mean() / 2) / max(altogether[0], 1e-6)
+    somebody += _COUNTED * brighter
+    return math.prod((*altogether, *widest)) ** 0.25 > _LARGE + _SOMEBODY * somebody
 
 
 def _deeper_shade(

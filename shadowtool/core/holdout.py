@@ -294,7 +294,8 @@ def _under_a_card(stack: Float32, on_line: list[Bool], lit: Float32) -> bool:
     both = (others > 0) & (shaded > 0)
     somebody = float(differs.mean() + both.mean() / 2) / max(altogether[0], 1e-6)
     somebody += _COUNTED * brighter
-    return math.prod((*altogether, *widest)) ** 0.25 > _LARGE + _SOMEBODY * somebody
+    large = math.prod((*altogether, *widest)) ** 0.25
+    return bool(large > _LARGE + _SOMEBODY * somebody)
 
 
 def _deeper_shade(

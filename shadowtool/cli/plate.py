@@ -40,8 +40,8 @@ from shadowtool.cli.options import gain_option, steady_option, step_command, tra
     show_default=True,
     help="plane: a shadow crossed a plane, as in a source, and what it didn't reach would be as"
     " dark as the rest. card: a card was waved over a scene, as in a target, and what never got"
-    " darker is in shade already. auto: by how much got dark, altogether and at once, and whether"
-    " what is dark looks like somebody.",
+    " darker is in shade already, unless it is as bright as what did. auto: by how much got dark,"
+    " altogether and at once, and whether what is dark looks like somebody.",
 )
 @gain_option
 @steady_option

@@ -35,6 +35,8 @@ _SLOPE = 0.05
 _MOST, _NEARLY_ALL = 0.6, 0.85
 # Within this many times the materials' spread a measured ratio is the plane's.
 _ALIKE = 2.5
+# Of ground in light colours differ by less than this, the range of a log over the channels.
+_COLOUR = 0.7
 # So many pixels at a time stay in the processor's cache.
 _BLOCK = 1 << 15
 # How far S/L of one plane's materials lies from their common one, as a part; at least.
@@ -121,8 +123,10 @@ def complete_shadow(
 ) -> Completed:
     """The shadow plate with S/L of the plane where the shadow itself says too little.
 
-    A take in which the shadow reached most of the picture is that of a waved card: what it never
-    darkened is in shade of its own, and what it darkened for several frames is as dark as it gets.
+    A take in which the shadow reached most of the picture is that of a waved card: what it darkened
+    for several frames is as dark as it gets, and what it never darkened is in shade of its own, as
+    far as it is no brighter than that makes ground around; what is as bright as ground in light the
+    card missed, and would be as dark as the rest.
     Else it is that of a plane which a shadow crossed: what is brighter than the plane's shadow was
     shaded in part, and what was never darkened would be as dark as the rest.
 
@@ -131,7 +135,7 @@ def complete_shadow(
         frames: (H, W), how many frames the shadow rests on.
         noise: the noise of one frame.
         plane: (H, W) the region of the plane, if it is known: the second reading holds there, the
-            first elsewhere.
+            first elsewhere, but that what was never darkened is left as it is.
         card: which of the two holds for all of it otherwise; None if nobody knows.
     """
     seen, dark = np.isfinite(channel_sum(lit)), np.isfinite(channel_sum(shadow))
@@ -156,6 +160,8 @@ def complete_shadow(
     if found is None:
         return Completed(result, np.asarray(dark, np.float32), plane is not None)
     expected, spread = found
+    looked_at = seen if plane is None and not partial else np.zeros_like(seen)
+    missed = _missed_by_the_card(lit, looked_at, dark, expected)
     gray -= np.log(channel_sum(expected) / 3)
     with np.errstate(invalid="ignore"):
         darker, alike = gray <= -_ALIKE * spread, np.abs(gray) < _ALIKE * spread
@@ -176,9 +182,29 @@ def complete_shadow(
         result.reshape(-1, 3)[where] = mean
     weight = own[few][:, None]
     result[few] = weight * result[few] + (1 - weight) * expected[few]
-    nothing = (own == 0) & (dark | region)
+    nothing = (own == 0) & (dark | region | missed)
     cv2.copyTo(expected, nothing.view(np.uint8), result)
     return Completed(result, own, partial)
+
+
+def _missed_by_the_card(lit: Float32, looked_at: Bool, dark: Bool, ratio: Float32) -> Bool:
+    """Where nothing got dark though light falls there, (H, W): what is more like lit ground around
+    than like that in shade, and not of quite another colour, as the sky is."""
+    never = looked_at & ~dark
+    where = _looked_at(looked_at & dark)
+    if not never.any() or where.size < 50:
+        return np.zeros_like(never)
+    light = np.log(np.maximum(lit, np.float32(1e-5)))
+    usual = _smooth(light.reshape(-1, 3).take(where, axis=0), where, dark.shape)
+    light -= _stretched(usual, dark.shape)
+    light[~never] = 0
+    # Over some area, past the ground's texture.
+    size = (2 * _cell(dark.shape) + 1,) * 2
+    weight = np.maximum(cv2.blur(never.astype(np.float32), size), np.float32(1e-6))
+    off = cv2.blur(light, size) / weight[..., np.newaxis]
+    halfway = np.log(np.maximum(ratio, np.float32(1e-5))).mean(axis=-1) / 2
+    near = off.mean(axis=-1) > halfway
+    return np.asarray(never & near & (np.ptp(off, axis=-1) < _COLOUR))
 
 
 def _opened(mask: Bool) -> Bool:

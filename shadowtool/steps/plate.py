@@ -237,8 +237,8 @@ def plate(
         logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
     elif figures.get("read_as") == UNDER_A_CARD and figures["shaded"] < _WELL_SHADED:
         logger.warning(
-            "%s: %.0f%% of the picture never got darker; it is in shade already, or the card's full"
-            " shadow was never there; if it was no card's, give --read-as plane",
+            "%s: %.0f%% of the picture never got darker; what is as bright as lit ground counts as"
+            " missed by the card, the rest as in shade; if there was no card, give --read-as plane",
             footage.sequence.pattern,
             100 * (1 - figures["shaded"]),
         )

@@ -149,7 +149,9 @@ def surfaces() -> np.ndarray:
 def carded() -> Take:
     """Such a scene under a card, with a part in shade of its own that nothing darkened."""
     own_shade = (COLUMNS > 140) | ((ROWS - 20) ** 2 + (COLUMNS - 40) ** 2 < 100)
-    return crossed(surfaces(), own_shade.astype(float))
+    take = crossed(surfaces(), own_shade.astype(float))
+    take.lit[own_shade] *= 0.15
+    return take
 
 
 def test_specks_of_something_else_in_the_shadow_are_no_surface() -> None:
@@ -183,6 +185,19 @@ def test_under_a_card_what_was_never_darkened_stays_lit() -> None:
     take = carded()
     never = take.frames == 0
     assert np.array_equal(take.completed().shadow[never], take.lit[never])
+
+
+def test_light_that_the_card_missed_is_told_from_shade_and_from_the_sky() -> None:
+    missed, sky = COLUMNS > 140, ROWS < 20
+    never = missed | sky
+    take = crossed(RATIO, never.astype(float))
+    take.lit[sky] = np.float32([0.2, 0.45, 0.9])
+    take.lit[missed & (ROWS > 70)] *= np.float32(0.15)
+    shadow = take.completed().shadow
+    ground = missed & (ROWS > 30) & (ROWS < 60)
+    assert take.error(shadow)[ground].mean() < 0.05
+    for alone in (sky & (ROWS < 12), missed & (ROWS > 78)):
+        assert np.array_equal(shadow[alone], take.lit[alone])
 
 
 def test_a_region_confines_what_the_plane_says() -> None:

@@ -165,6 +165,10 @@ def complete_shadow(
     gray -= np.log(channel_sum(expected) / 3)
     with np.errstate(invalid="ignore"):
         darker, alike = gray <= -_ALIKE * spread, np.abs(gray) < _ALIKE * spread
+        # At the rim of what the card missed only its penumbra fell.
+        size = np.ones((4 * _cell(dark.shape) + 1,) * 2, np.uint8)
+        rim = (gray > _ALIKE * spread) & (cv2.dilate(missed.view(np.uint8), size) > 0)
+        rim &= dark & ~_opened(level)
     expected *= lit
     own = dark.astype(np.float32)
     few = region & dark & darker
@@ -182,6 +186,7 @@ def complete_shadow(
         result.reshape(-1, 3)[where] = mean
     weight = own[few][:, None]
     result[few] = weight * result[few] + (1 - weight) * expected[few]
+    own[rim] = 0
     nothing = (own == 0) & (dark | region | missed)
     cv2.copyTo(expected, nothing.view(np.uint8), result)
     return Completed(result, own, partial)
@@ -195,16 +200,20 @@ def _missed_by_the_card(lit: Float32, looked_at: Bool, dark: Bool, ratio: Float3
     if not never.any() or where.size < 50:
         return np.zeros_like(never)
     light = np.log(np.maximum(lit, np.float32(1e-5)))
-    usual = _smooth(light.reshape(-1, 3).take(where, axis=0), where, dark.shape)
-    light -= _stretched(usual, dark.shape)
+    darkened = light.reshape(-1, 3).take(where, axis=0)
+    around = _stretched(_smooth(darkened, where, dark.shape), dark.shape)
     light[~never] = 0
     # Over some area, past the ground's texture.
     size = (2 * _cell(dark.shape) + 1,) * 2
     weight = np.maximum(cv2.blur(never.astype(np.float32), size), np.float32(1e-6))
-    off = cv2.blur(light, size) / weight[..., np.newaxis]
+    own = cv2.blur(light, size) / weight[..., np.newaxis]
     halfway = np.log(np.maximum(ratio, np.float32(1e-5))).mean(axis=-1) / 2
-    near = off.mean(axis=-1) > halfway
-    return np.asarray(never & near & (np.ptp(off, axis=-1) < _COLOUR))
+    missed = np.zeros_like(never)
+    # Next to something that stands on the ground that is what is around, but not all ground.
+    for usual in (around, np.median(darkened, axis=0)):
+        off = own - usual
+        missed |= (off.mean(axis=-1) > halfway) & (np.ptp(off, axis=-1) < _COLOUR)
+    return np.asarray(missed & never)
 
 
 def _opened(mask: Bool) -> Bool:

@@ -189,13 +189,14 @@ def test_under_a_card_what_was_never_darkened_stays_lit() -> None:
 
 def test_light_that_the_card_missed_is_told_from_shade_and_from_the_sky() -> None:
     missed, sky = COLUMNS > 140, ROWS < 20
-    never = missed | sky
-    take = crossed(RATIO, never.astype(float))
+    # At its rim only the card's penumbra fell.
+    reached = np.maximum(smoothstep((COLUMNS - 128) / 12), sky)
+    take = crossed(RATIO, reached)
     take.lit[sky] = np.float32([0.2, 0.45, 0.9])
     take.lit[missed & (ROWS > 70)] *= np.float32(0.15)
     shadow = take.completed().shadow
-    ground = missed & (ROWS > 30) & (ROWS < 60)
-    assert take.error(shadow)[ground].mean() < 0.05
+    ground = (COLUMNS > 120) & (ROWS > 30) & (ROWS < 60)
+    assert np.percentile(take.error(shadow)[ground], 90) < 0.1
     for alone in (sky & (ROWS < 12), missed & (ROWS > 78)):
         assert np.array_equal(shadow[alone], take.lit[alone])
 

@@ -199,21 +199,25 @@ def _missed_by_the_card(lit: Float32, looked_at: Bool, dark: Bool, ratio: Float3
     where = _looked_at(looked_at & dark)
     if not never.any() or where.size < 50:
         return np.zeros_like(never)
-    light = np.log(np.maximum(lit, np.float32(1e-5)))
-    darkened = light.reshape(-1, 3).take(where, axis=0)
-    around = _stretched(_smooth(darkened, where, dark.shape), dark.shape)
-    light[~never] = 0
-    # Over some area, past the ground's texture.
-    size = (2 * _cell(dark.shape) + 1,) * 2
-    weight = np.maximum(cv2.blur(never.astype(np.float32), size), np.float32(1e-6))
-    own = cv2.blur(light, size) / weight[..., np.newaxis]
-    halfway = np.log(np.maximum(ratio, np.float32(1e-5))).mean(axis=-1) / 2
-    missed = np.zeros_like(never)
+    light = np.log(np.maximum(lit.reshape(-1, 3).take(where, axis=0), np.float32(1e-5)))
+    # Areas are told by some of their pixels.
+    every = (slice(None, None, _step(dark.shape)),) * 2
+    around = _stretched(_smooth(light, where, dark.shape), dark.shape)[every].copy()
+    wanted = never[every]
+    own = np.log(np.maximum(lit[every], np.float32(1e-5)))
+    own[~wanted] = 0
+    # Past the ground's texture.
+    size = (2 * (_cell(dark.shape) // _step(dark.shape)) + 1,) * 2
+    weight = np.maximum(cv2.blur(wanted.astype(np.float32), size), np.float32(1e-6))
+    own = cv2.blur(own, size) / weight[..., np.newaxis]
+    halfway = np.log(np.maximum(ratio[every], np.float32(1e-5))).mean(axis=-1) / 2
+    missed = np.zeros_like(wanted)
     # Next to something that stands on the ground that is what is around, but not all ground.
-    for usual in (around, np.median(darkened, axis=0)):
+    for usual in (around, np.median(light, axis=0)):
         off = own - usual
         missed |= (off.mean(axis=-1) > halfway) & (np.ptp(off, axis=-1) < _COLOUR)
-    return np.asarray(missed & never)
+    whole = cv2.resize(missed.view(np.uint8), dark.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray((whole > 0) & never)
 
 
 def _opened(mask: Bool) -> Bool:

@@ -336,15 +336,16 @@ def _steepen(beta: Float32, hidden: Bool) -> None:
     box = around(hidden, _NEARBY)
     if box is None:
         return
-    whole, parts = beta[box], cv2.connectedComponents(hidden[box].view(np.uint8))
+    whole = beta[box]
+    count, labels = cv2.connectedComponents(hidden[box].view(np.uint8))
     # How wide a penumbra is tells its steepest slope.
     seen = np.where(hidden[box], np.float32(np.nan), whole)
     across, down = (np.abs(np.diff(seen, axis=axis, prepend=np.nan)) for axis in (1, 0))
     slope = np.fmax(across, down)
-    for part in range(1, parts[0]):
-        own = around(parts[1] == part, _NEARBY)
+    for part in range(1, count):
+        own = around(labels == part, _NEARBY)
         assert own is not None
-        inside = (parts[1][own] == part).view(np.uint8)
+        inside = (labels[own] == part).view(np.uint8)
         wide = 2 * float(cv2.distanceTransform(np.pad(inside, 1), cv2.DIST_L2, 3).max())
         near = cv2.dilate(inside, np.ones((2 * _NEARBY + 1,) * 2, np.uint8)) > 0
         beside = (cv2.dilate(inside, np.ones((2 * _RING + 1,) * 2, np.uint8)) > 0) & (inside == 0)

@@ -16,7 +16,8 @@ _AROUND, _FLAT = (5, 5), (2.5 / 255) ** 2
 
 
 def chroma_at_luma(chroma: Float32, luma: Float32) -> Float32:
-    """Chroma with as many samples as luma, by a guided filter (He, Sun and Tang 2013).
+    """Chroma with as many samples as luma, by a guided filter (He, Sun and Tang 2013): a·luma and
+    what that leaves of the samples, a = cov(chroma, luma) / var(luma) around.
 
     Args:
         chroma: (h, w), with samples on every second of luma's columns and between its rows, or as

@@ -160,21 +160,19 @@ def complete_shadow(
     if found is None:
         return Completed(result, np.asarray(dark, np.float32), plane is not None)
     expected, spread = found
-    looked_at = seen if plane is None and not partial else np.zeros_like(seen)
-    missed = _missed_by_the_card(lit, looked_at, dark, expected)
+    surface, missed = _opened(level), np.zeros_like(dark)
+    if not partial:
+        missed = _missed_by_the_card(lit, seen, dark, expected)
     gray -= np.log(channel_sum(expected) / 3)
     with np.errstate(invalid="ignore"):
         darker, alike = gray <= -_ALIKE * spread, np.abs(gray) < _ALIKE * spread
-        # At the rim of what the card missed only its penumbra fell.
-        size = np.ones((4 * _cell(dark.shape) + 1,) * 2, np.uint8)
-        rim = (gray > _ALIKE * spread) & (cv2.dilate(missed.view(np.uint8), size) > 0)
-        rim &= dark & ~_opened(level)
+        brighter = gray > _ALIKE * spread
     expected *= lit
     own = dark.astype(np.float32)
     few = region & dark & darker
     own[few] = np.minimum(frames[few] / np.float32(_FIRM), 1)
     # On the plane only what is level over some area can be a surface of its own.
-    own[region & ~(darker | alike | (_opened(level) & ~alone))] = 0
+    own[region & ~(darker | alike | (surface & ~alone))] = 0
     # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
     both = np.flatnonzero(alike & region & (own > 0))
     for start in range(0, both.size, _BLOCK):
@@ -186,7 +184,11 @@ def complete_shadow(
         result.reshape(-1, 3)[where] = mean
     weight = own[few][:, None]
     result[few] = weight * result[few] + (1 - weight) * expected[few]
-    own[rim] = 0
+    if missed.any():
+        # At the rim of what the card missed only its penumbra fell.
+        size = np.ones((4 * _cell(dark.shape) + 1,) * 2, np.uint8)
+        beside = cv2.dilate(missed.view(np.uint8), size) > 0
+        own[beside & brighter & dark & ~surface] = 0
     nothing = (own == 0) & (dark | region | missed)
     cv2.copyTo(expected, nothing.view(np.uint8), result)
     return Completed(result, own, partial)

@@ -162,7 +162,8 @@ def line_pace(
 ) -> Float64:
     """How fast the lines pass points of the picture, pixels a frame along their normals.
 
-    Before a low camera lines fan out, and pass some points many times as fast as others.
+    Before a low camera lines fan out, and pass some points many times as fast as others: by
+    |(n'·p + d') - (n·p + d)| a frame from one line to the next.
 
     Args:
         times: (N,), frame numbers; those beyond the lines' span count as its ends.

@@ -489,7 +489,8 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     gains = {frame: take.gain(frame, grid) for frame, grid in grids.items()}
     take.known_gains = gains
     # Where a figure is held out by what was given it is a source.
-    if apart and take.held is None and take.card is not True:
+    undecided = take.held is None and take.card is None
+    if apart and (undecided or (automatic and not take.card)):
         level = [grids[frame] / np.float32(gains[frame]) for frame in apart]
         background = find_background(level, noise)
         if take.card is None and background.under_card:

@@ -47,6 +47,9 @@ _SHADED, _MOST, _AT_ONCE = 0.5, 0.5, 0.2
 # more than a factor.
 _LARGE, _SOMEBODY = 0.09, 0.6
 _BRIGHTER, _COUNTED, _DIFFERS = 0.1, 7.0, 1.35
+# Ranks of samples that are lit: one to compare with, and two whose texture is the ground's. Samples
+# with ratios this much around a frequent one have texture in common with it if they are shadow.
+_RANKS, _AROUND, _LEAST_LIKELY = (0.85, 0.8, 0.95), 0.3, 0.05
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
 # Decided pixels are dropped when no more than this part is left.
@@ -99,7 +102,7 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     stack = np.nan_to_num(stack, copy=False, nan=0.0, posinf=1e4, neginf=0.0)
     weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
     ascending = np.argsort(stack.sum(axis=1), axis=0)
-    ratio = _common_ratio(stack, ascending, noise)[:, None]
+    ratio = _common_ratio(stack, ascending, noise, shape[:2])[:, None]
     lit = _most_supported(stack, ascending, weighed, ratio)
     shadow = lit * ratio
     on_line = [_on_line(sample, lit, shadow) for sample in weighed]
@@ -149,20 +152,27 @@ def _ranked(stack: Float32, order: Index, pixels: Index) -> Float32:
     return np.ascontiguousarray(stack[order[pixels], :, pixels].T)
 
 
-def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float32:
+def _common_ratio(
+    stack: Float32, ascending: Index, noise: NoiseModel, size: tuple[int, int]
+) -> Float32:
     """S/L, (3,): the ratio below 1 between a pixel's samples and a brighter one that is much more
     frequent than those a little above and below.
 
     Shadow keeps the ground's texture, so its ratio is the same everywhere; a figure's is not, and
     in a penumbra all ratios occur. So ratios of shadow scatter in no channel by more than noise,
-    where those of a figure scatter as widely as they are looked at. Of a shadow that is all but
+    where those of a figure scatter as widely as they are looked at. Plain clothes before even
+    ground have one ratio, too, but nothing of the ground's texture. Of a shadow that is all but
     black noise leaves no ratio, but then more samples are black than have any one.
     """
     everywhere = np.arange(stack.shape[2])
-    bright = _ranked(stack, ascending[int(0.85 * (len(stack) - 1))], everywhere)
+    bright, *others = (
+        _ranked(stack, ascending[int(rank * (len(stack) - 1))], everywhere) for rank in _RANKS
+    )
     light = bright.sum(axis=0)
     clear = light > _CLEAR * noise.sigma(bright.T).sum(axis=1)
-    part = stack.sum(axis=1) / np.where(clear, light, 1)
+    total = stack.sum(axis=1)
+    textures = [other.sum(axis=0) for other in others]
+    part = total / np.where(clear, light, 1)
     difference = np.where(clear, np.log(np.maximum(part, 1e-4)), 1)
     # Beyond what is looked for, too: it is next to some of that.
     counts, edges = np.histogram(difference, bins=210, range=(-_DEEPEST, 0.25))
@@ -173,11 +183,13 @@ def _common_ratio(stack: Float32, ascending: Index, noise: NoiseModel) -> Float3
         peak = int(np.argmax(excess))
         if excess[peak] <= 0:
             break
-        alike = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2) < _ALIKE
+        away = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2)
+        alike = away < _ALIKE
         if alike.sum() >= _TELLING:
             ratio, scatter, noisy = _told(stack, bright, alike, noise)
             lowered = min(float(np.hypot(1, noisy / _ALIKE)), _LOWERED)
-            if (weight := excess[peak] * lowered / scatter) > best:
+            follows = _follows(total, away < _AROUND, textures, size)
+            if (weight := excess[peak] * lowered * follows / scatter) > best:
                 found, best, usual = ratio, weight, alike.sum() / scatter
         excess[max(peak - _BINS, 0) : peak + _BINS + 1] = -np.inf
     black = difference <= -_DEEPEST
@@ -201,6 +213,35 @@ def _told(
     scatter = max(float(np.median(off / np.hypot(noisy, _SCATTER))), 1.0)
     ratio = np.asarray(np.clip(np.median(ratios, axis=0), 0, 0.9), np.float32)
     return ratio, scatter, float(np.median(noisy))
+
+
+def _follows(total: Float32, chosen: Bool, textures: list[Float32], size: tuple[int, int]) -> float:
+    """How much the chosen samples may have of the texture of lit ground: 1 is all, and also the
+    answer where that can't be told; `_LEAST_LIKELY` is nothing.
+
+    It is the slope of logarithmic steps from point to point, and twice its standard error.
+
+    Args:
+        total: (T, N), of the grid's points.
+        chosen: (T, N).
+        textures: lit ground twice, (N,), so that noise is not taken for its texture.
+    """
+    logarithms = [
+        np.log(np.maximum(values, np.float32(1e-4))).reshape(-1, *size)
+        for values in (total, *textures)
+    ]
+    pairs = []
+    for axis in (1, 2):
+        where = np.moveaxis(chosen.reshape(-1, *size), axis, -1)
+        time, row, column = np.nonzero(where[..., 1:] & where[..., :-1])
+        steps = (np.diff(np.moveaxis(values, axis, -1)) for values in logarithms)
+        pairs.append([step[time * (len(step) > 1), row, column] for step in steps])
+    own, one, other = np.hstack(pairs)
+    texture = float(one @ other)
+    error = float(np.linalg.norm(own) * np.linalg.norm(other)) / max(len(own), 1) ** 0.5
+    if texture <= 2 * error:
+        return 1.0
+    return float(np.clip((own @ other + 2 * error) / texture, _LEAST_LIKELY, 1))
 
 
 def _smoothed(counts: NDArray[np.integer], bins: int) -> NDArray[np.float64]:

@@ -188,6 +188,28 @@ def test_a_large_figure_in_one_colour_is_no_deep_shadow(sky: float) -> None:
     assert found == pytest.approx(ratio, rel=0.15)
 
 
+@pytest.mark.parametrize("grain", [0.03, 0.08, 0.2])
+@pytest.mark.parametrize("clothes", [0.01, 0.02, 0.04])
+def test_plain_dark_clothes_that_fill_much_of_a_picture_are_no_shadow(
+    clothes: float, grain: float
+) -> None:
+    """All of one colour before even ground; what tells is that ground is never quite even."""
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 1)
+    lit = 0.4 * np.exp(grain / texture.std() * texture)[..., None] * np.array([1.05, 1.0, 0.9])
+    ratio = np.array([0.18, 0.23, 0.3])
+    frames = []
+    for number in range(0, FRAMES, 2):
+        x = -30 + 300 * number / (FRAMES - 1)
+        image = lit * (ratio + shadow_beta(x)[..., None] * (1 - ratio))
+        figure = np.hypot((COLUMNS - x) / 40, (ROWS - 50) / 58) < 1
+        image[figure] = clothes * np.array([1.0, 0.9, 0.95])
+        frames.append(SCENE.noisy(image.astype(np.float32), number))
+    background = find_background(frames, NOISE)
+    found = np.median((background.shadow / background.lit)[110:], axis=(0, 1))
+    assert found == pytest.approx(ratio, rel=0.05)
+
+
 def test_a_surface_that_shade_makes_darker_than_others_is_background_too() -> None:
     wall = (COLUMNS > 100) & (COLUMNS < 160) & (ROWS > 95)
     grain = 0.7 * np.exp(0.4 * np.random.default_rng(0).normal(size=wall.shape))[..., None]

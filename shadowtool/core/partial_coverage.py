@@ -33,8 +33,9 @@ _COMMON = 0.45
 _SLOPE = 0.05
 # A shadow that reached more than this part of a picture was cast to reach all of it.
 _MOST, _NEARLY_ALL = 0.6, 0.85
-# Within this many times the materials' spread a measured ratio is the plane's.
-_ALIKE = 2.5
+# Within this many times the materials' spread a measured ratio is the plane's. A surface with
+# another is as large as a square of so many coarse cells.
+_ALIKE, _SURFACE = 2.5, 4
 # Of ground in light colours differ by less than this, the range of a log over the channels.
 _COLOUR = 0.7
 # So many pixels at a time stay in the processor's cache.
@@ -163,7 +164,9 @@ def complete_shadow(
     surface, missed = _opened(level), np.zeros_like(dark)
     if not partial:
         missed = _missed_by_the_card(lit, seen, dark, expected)
-    gray -= np.log(channel_sum(expected) / 3)
+    common = np.log(channel_sum(expected) / 3)
+    above = usual - common > spread
+    gray -= common
     with np.errstate(invalid="ignore"):
         darker, alike = gray <= -_ALIKE * spread, np.abs(gray) < _ALIKE * spread
         brighter = gray > _ALIKE * spread
@@ -171,8 +174,9 @@ def complete_shadow(
     own = dark.astype(np.float32)
     few = region & dark & darker
     own[few] = np.minimum(frames[few] / np.float32(_FIRM), 1)
-    # On the plane only what is level over some area can be a surface of its own.
-    own[region & ~(darker | alike | (surface & ~alone))] = 0
+    # On the plane only what is level over some area can be a surface of its own: in a take of few
+    # frames a partial shadow is level here and there.
+    own[region & ~(darker | alike | (_large(surface & above) & ~alone))] = 0
     # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
     both = np.flatnonzero(alike & region & (own > 0))
     for start in range(0, both.size, _BLOCK):
@@ -226,6 +230,14 @@ def _opened(mask: Bool) -> Bool:
     """A mask without what is narrower than a few pixels: noise that looks like a shadow."""
     small = np.ones((5, 5), np.uint8)
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
+
+
+def _large(mask: Bool) -> Bool:
+    """The connected parts of a mask that are as large as several coarse cells."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] >= (_SURFACE * _cell(mask.shape)) ** 2
+    large[0] = False
+    return np.asarray(large[labels])
 
 
 def _log_ratio(lit: Float32, shadow: Float32) -> Float32:

@@ -140,6 +140,27 @@ def test_another_surface_on_the_plane_keeps_its_own_shadow() -> None:
     assert take.error(take.completed().shadow)[inside].max() < 0.05
 
 
+def test_a_surface_keeps_its_own_shadow_through_noise() -> None:
+    ratio = np.tile(RATIO, (HEIGHT, WIDTH, 1))
+    ratio[35:55, 60:90] *= 1.6
+    take = crossed(ratio, band(), frames=4)
+    grain = np.random.default_rng(1).normal(0, 10 * SIGMA / np.sqrt(4), take.truth.shape)
+    measured = (take.measured + grain).astype(np.float32)
+    noise = NoiseModel(np.zeros(3), np.full(3, (10 * SIGMA) ** 2))
+    found = complete_shadow(take.lit, measured, take.frames, noise)
+    inside = slice(38, 52), slice(63, 87)
+    assert np.median(take.error(found.shadow)[inside]) < 0.1
+
+
+def test_a_few_pixels_in_one_partial_shadow_are_no_surface() -> None:
+    """Where a thin shadow went by in few frames some pixels were darkened alike, but not in full."""
+    reached = band()
+    for column in range(10, 150, 30):
+        reached[37:52, column : column + 15] = 0.5
+    take = crossed(RATIO, reached)
+    assert np.quantile(take.error(take.completed().shadow)[36:54], 0.99) < 0.15
+
+
 def surfaces() -> np.ndarray:
     """S/L of a scene of many different surfaces, (H, W, 3)."""
     levels = np.random.default_rng(5).uniform(0.08, 0.6, (6, 8))

@@ -16,7 +16,11 @@ class InputError(ShadowtoolError):
     """Footage or a product that was given can't be used as it is."""
 
 
-class DamagedFileError(InputError):
+class MissingError(InputError):
+    """A frame that isn't there, or not whole: the rest can do without it, if the user says so."""
+
+
+class DamagedFileError(MissingError):
     """A file that is there but can't be read whole."""
 
 

@@ -13,7 +13,7 @@ from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
-from shadowtool.errors import InputError, RetryError, ShadowtoolError
+from shadowtool.errors import InputError, MissingError, RetryError, ShadowtoolError
 
 _PREFIX = ".shadowtool-"
 _RETRY = {
@@ -139,7 +139,7 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise MissingError(f"{path}: no such file") from None
     except OSError as error:
         raise translated(error, path, "read") from None
 

@@ -16,7 +16,7 @@ from fileseq.filesequence import FileSequence
 from fileseq.frameset import FrameSet
 
 from shadowtool.choices import Missing
-from shadowtool.errors import InputError, OptionError
+from shadowtool.errors import InputError, MissingError, OptionError
 from shadowtool.io.files import is_file, leads_nowhere, real
 from shadowtool.io.image import EXR, PNG
 
@@ -55,12 +55,12 @@ class Sequence:
         """The frame's file.
 
         Raises:
-            InputError: the sequence has no such frame.
+            MissingError: the sequence has no such frame.
         """
         try:
             return self.files[frame]
         except KeyError:
-            raise InputError(
+            raise MissingError(
                 f"{self.pattern}: has no frame {frame}, only {frame_range(self.files)}"
             ) from None
 

@@ -18,10 +18,9 @@ from shadowtool.core.resizing import resized
 from shadowtool.core.shadow_time import luminance
 from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import (
-    DamagedFileError,
     InputError,
+    MissingError,
     OptionError,
-    OutputExistsError,
     ReshootError,
 )
 from shadowtool.io.files import new_folders, real
@@ -38,7 +37,9 @@ from shadowtool.steps.run import (
     current,
     name_of_frames,
     refuse_existing,
+    refuse_other_format,
     refuse_other_step,
+    say_skipped,
     warn_of_nan,
     with_other_chunks,
     write_manifest,
@@ -117,6 +118,7 @@ def capture(
         "capture",
         {
             "transfer": transfer,
+            "start": start,
             "crop": None if crop is None else str(crop),
             "scale": scale,
             "format": file_format,
@@ -134,14 +136,12 @@ def capture(
         if strict:
             _require_still(opened.name, kept.figures["camera_motion"])
         return kept
-    there = sorted(output.iterdir()) if output.is_dir() else []
-    for file in there:
-        if file.name.startswith(f"{name}.") and file.suffix in {EXR, PNG} - {suffix}:
-            raise OutputExistsError(f"{file}: a frame in another format; give another folder")
+    refuse_other_format(output, name, suffix)
     if opened.wanted is not None:
         refuse_existing(map(taking.place, opened.wanted), run)
     else:
-        refuse_existing((file for file in there if file.suffix == suffix), run)
+        there = sorted(output.glob(f"*{suffix}"))
+        refuse_existing(there, run)
     with new_folders([output], shared=run.frames is not None):
         frames, skipped, report = taking.take()
         if not frames:
@@ -269,9 +269,10 @@ class _Taking:
         def work(arriving: Arriving) -> _Measured | Frame:
             try:
                 return self._write(arriving, reference)
-            except DamagedFileError:
+            except MissingError as error:
                 if self.run.missing == "error":
                     raise
+                say_skipped(error)
                 return arriving.frame
 
         total = self.source.total

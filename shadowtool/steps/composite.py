@@ -24,13 +24,14 @@ from shadowtool.io.image import (
     Header,
     Image,
     read_image,
+    resolve_transfer,
     to_code,
     write_exr,
     write_png,
 )
 from shadowtool.io.products import WARP, read_plates, read_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
-from shadowtool.steps.footage import require_frames, require_size, say_plates_assumed
+from shadowtool.steps.footage import require_frames, require_size, say_taken_as
 from shadowtool.steps.matte import BETA_FOLDER, FIGURE_FOLDER
 from shadowtool.steps.run import (
     Figures,
@@ -39,6 +40,7 @@ from shadowtool.steps.run import (
     Result,
     Run,
     name_of_frames,
+    refuse_other_format,
     with_figures,
 )
 
@@ -80,7 +82,9 @@ def composite(
     beta_frames = open_sequence(beta or _part(mattes, BETA_FOLDER), "β")
     frames, absent = beta_frames.select(run.frames, run.missing)
     stored = read_plates(plates)
-    say_plates_assumed(plates, stored)
+    say_taken_as(plates, stored.transfer)
+    figure_transfer = resolve_transfer("auto", figure_frames.path(figure_frames.frames[0]))
+    say_taken_as(figure_frames.pattern, figure_transfer)
     lit, shadow, repaired = _complete(stored.plates.lit, stored.plates.shadow)
     header = stored.header
     for sequence in (figure_frames, beta_frames):
@@ -93,6 +97,7 @@ def composite(
         shared.append(mark)
     suffix = EXR if file_format == "exr" else PNG
     name = name_of_frames(output)
+    refuse_other_format(output, name, suffix)
     recipe = Recipe(
         "composite",
         {"fill": fill, "format": file_format, "ratio": ratio},
@@ -102,6 +107,7 @@ def composite(
             "--plates": real(plates).name,
         }
         | ({} if warp is None else {"--warp": warp.name}),
+        {"--fg": figure_transfer, "--plates": stored.transfer},
     )
     if repaired:
         logger.warning(

@@ -21,13 +21,16 @@ from shadowtool.core.noise import (
 from shadowtool.core.trembling import UNSTEADY, strips
 from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
-from shadowtool.io.products import StoredPlates
 from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
 
 logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
+
+
+# Steps whose mattes lie where the plates see the scene from.
+_IN_PLACE = ("shadowtool plate ", "shadowtool matte ")
 
 
 class Survey(NamedTuple):
@@ -68,12 +71,13 @@ class Footage:
 
     def read(self, frame: Frame) -> NDArray[np.floating]:
         """(H, W, 3) linear light, from the vantage; float16 where the file holds linear halfs."""
-        return self.light(self.image(frame))
+        return self.light(self.image(frame))[0]
 
-    def light(self, image: Image) -> NDArray[np.floating]:
-        """The same of a frame that was read."""
+    def light(self, image: Image) -> tuple[NDArray[np.floating], Place]:
+        """The same of a frame that was read, and where it was moved from, as of `off`."""
         values = image.rgb(self.transfer)
-        return displaced(values, self.off(values))
+        place = self.off(values)
+        return displaced(values, place), place
 
     def off(self, light: NDArray[np.floating]) -> Place:
         """How far a frame's light, (H, W) or (H, W, 3), is off what the vantage sees, as of
@@ -143,24 +147,29 @@ def open_footage(
     return Footage(sequence, first, resolve_transfer(transfer, next(iter(sequence.files.values()))))
 
 
+def moved_with(values: NDArray[np.floating], header: Header, place: Place) -> NDArray[np.floating]:
+    """A frame's matte, moved as the frame is: mattes from elsewhere lie where the camera saw the
+    frame. Those of our own steps were made of frames that had been moved.
+
+    Args:
+        values: (H, W).
+        header: of the matte's file.
+        place: as of `Footage.off`.
+    """
+    command = header.provenance.get("command", "")
+    return values if command.startswith(_IN_PLACE) else displaced(values, place)
+
+
 def say_assumed(footage: Footage, transfer: str) -> None:
     """Say what code values are taken for, if that was not given and is not light itself."""
-    if transfer == "auto" and footage.transfer != "linear":
-        logger.warning(
-            "%s: PNG is taken as %s; give --transfer if it is not",
-            footage.sequence.pattern,
-            footage.transfer,
-        )
+    if transfer == "auto":
+        say_taken_as(footage.sequence.pattern, footage.transfer, "give --transfer if it is not")
 
 
-def say_plates_assumed(folder: Path, stored: StoredPlates, transfer: str = "auto") -> None:
-    """The same of plates."""
-    if transfer == "auto" and stored.transfer != "linear":
-        logger.warning(
-            "%s: PNG is taken as %s; write the plates as EXR if they are not",
-            folder,
-            stored.transfer,
-        )
+def say_taken_as(name: object, transfer: str, remedy: str = "write it as EXR if it is not") -> None:
+    """The same of any picture for which no transfer function was given."""
+    if transfer != "linear":
+        logger.warning("%s: PNG is taken as %s; %s", name, transfer, remedy)
 
 
 def _require_same(path: Path, header: Header, first: Header, of: str) -> None:

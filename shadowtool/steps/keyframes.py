@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.choices import Missing
+from shadowtool.core.camera_motion import Place
 from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
 from shadowtool.core.trimap_flow import Carried, Link, carry, flow_picture, links, merge
 from shadowtool.errors import DamagedFileError, InputError
-from shadowtool.io.image import read_image
+from shadowtool.io.image import read_header, read_image
 from shadowtool.io.sequence import Frame, Sequence
-from shadowtool.steps.footage import Footage, require_frames
+from shadowtool.steps.footage import Footage, moved_with, require_frames
 
 UInt8 = NDArray[np.uint8]
 
@@ -76,14 +77,23 @@ class Keyframes:
             files += [self.footage.sequence.path(step) for step in self._way(frame, key)[1:]]
         return files
 
-    def trimap(self, frame: Frame) -> UInt8:
+    def trimap(self, frame: Frame, place: Place) -> UInt8:
         """A frame's trimap, (H, W) uint8: as drawn, or carried from the keyframes beside it; all
-        unknown if they are too far away."""
-        sides = [self._carried(frame, key) for key in self._keys(frame)]
+        unknown if they are too far away.
+
+        Args:
+            place: where the frame is moved, as of `Footage.off`; trimaps are drawn on what the
+                camera saw.
+        """
+        keys = self._keys(frame)
+        sides = [self._carried(frame, key) for key in keys]
         if not sides:
             width, height = self.footage.header.size
             return np.full((height, width), UNKNOWN, np.uint8)
-        return merge(sides)
+        whole = merge(sides)
+        header = read_header(self.drawn.path(keys[0]))
+        moved = moved_with(whole / np.float32(FIGURE), header, place)
+        return _three_levels(moved, 1 / 4, 3 / 4)
 
     def _keys(self, frame: Frame) -> list[Frame]:
         """The keyframe itself, or those before and after that are near enough."""
@@ -110,8 +120,11 @@ class Keyframes:
 
 def trimap_of(path: Path) -> UInt8:
     """A trimap from a file, (H, W) uint8: what is nearly black or white, and the rest unknown."""
-    plane = np.nan_to_num(read_image(path).plane("Y"))
+    return _three_levels(np.nan_to_num(read_image(path).plane("Y")), _BLACK, _WHITE)
+
+
+def _three_levels(plane: NDArray[np.floating], black: float, white: float) -> UInt8:
     trimap = np.full(plane.shape, UNKNOWN, np.uint8)
-    trimap[plane < _BLACK] = BACKGROUND
-    trimap[plane > _WHITE] = FIGURE
+    trimap[plane < black] = BACKGROUND
+    trimap[plane > white] = FIGURE
     return trimap

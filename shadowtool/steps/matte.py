@@ -14,7 +14,7 @@ from shadowtool.core import beta as shadow_beta
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.boxes import Box, around
-from shadowtool.core.camera_motion import Place, Vantage, displaced
+from shadowtool.core.camera_motion import Place, Vantage
 from shadowtool.core.exposure import frame_gain, without_gain
 from shadowtool.core.half_floats import not_finite, to_float
 from shadowtool.core.holdout import grid_step, on_grid
@@ -32,16 +32,17 @@ from shadowtool.core.trembling import UNSTEADY, off_place, strips
 from shadowtool.core.trimap import FIGURE
 from shadowtool.errors import OptionError
 from shadowtool.io.files import real
-from shadowtool.io.image import EXR, PNG, Header, read_image, to_half, write_exr, write_png
+from shadowtool.io.image import EXR, PNG, Header, Image, read_image, to_half, write_exr, write_png
 from shadowtool.io.products import read_plates
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import (
     Footage,
+    moved_with,
     open_footage,
     require_frames,
     require_size,
     say_assumed,
-    say_plates_assumed,
+    say_taken_as,
 )
 from shadowtool.steps.keyframes import Keyframes
 from shadowtool.steps.run import Figures, FrameWork, Recipe, Result, Run, with_figures
@@ -108,7 +109,8 @@ def matte(
     say_assumed(footage, transfer)
     frames, absent = footage.sequence.select(run.frames, run.missing)
     stored = read_plates(plates, transfer)
-    say_plates_assumed(plates, stored, transfer)
+    if transfer == "auto":
+        say_taken_as(plates, stored.transfer)
     require_size(plates, stored.header, footage.header, footage.sequence.pattern)
     if alpha is not None and (trimap is not None or only == "trimap"):
         raise OptionError("--alpha needs no trimaps; give it without --trimap and --only trimap")
@@ -137,12 +139,13 @@ def matte(
             "gain": gain,
             "only": only,
             "steady": steady,
-            "transfer": footage.transfer,
+            "transfer": footage.transfer if stored.transfer == footage.transfer else transfer,
             "noise": noise.record(),
         },
         {"frames": Path(footage.sequence.pattern).name}
         | {"--plates": real(plates).name}
         | {f"--{role}": Path(sequence.pattern).name for role, sequence in given.items()},
+        {"frames": footage.transfer, "--plates": stored.transfer},
     )
     wanted = tuple(product for product in PRODUCTS if only in (None, product))
     if "alpha" in given:
@@ -361,9 +364,7 @@ class _Take:
 
     def _shown(self, frame: Frame) -> _Shown:
         stored = self.footage.image(frame)
-        light = stored.rgb(self.footage.transfer)
-        place = self.footage.off(light)
-        light = displaced(light, place)
+        light, place = self.footage.light(stored)
         bad = not_finite(light)
         gain = 1.0
         if self.gain == "auto":
@@ -373,8 +374,9 @@ class _Take:
 
     def _figure(self, frame: Frame, shown: _Shown) -> _Figure:
         if self.alpha is not None:
-            matte = np.clip(displaced(_matte_plane(self.alpha.path(frame)), shown.moved), 0, 1)
-            matte = matte.astype(np.float32, copy=False)
+            stored = read_image(self.alpha.path(frame))
+            matte = moved_with(_matte_plane(stored), stored.header, shown.moved)
+            matte = np.clip(matte, 0, 1).astype(np.float32, copy=False)
             box = around(matte > 0, MARGIN) or _NONE
             alpha, image = matte[box].copy(), shown.at(box)
             backdrop, unknown = self.scene.backdrop.at(box), self.scene.unknown[box]
@@ -383,7 +385,7 @@ class _Take:
         return self._pulled(frame, shown)
 
     def _pulled(self, frame: Frame, shown: _Shown) -> _Figure:
-        given = None if self.keyframes is None else self.keyframes.trimap(frame)
+        given = None if self.keyframes is None else self.keyframes.trimap(frame, shown.moved)
         drawn = self.keyframes is not None and frame in self.keyframes.drawn.files
         mask = self._differs(shown)
         if drawn and given is not None:
@@ -454,9 +456,9 @@ def _figure_layers(figure: _Figure, shape: tuple[int, ...]) -> dict[str, NDArray
     return {"RGBA": rgba}
 
 
-def _matte_plane(path: Path) -> Float32:
+def _matte_plane(stored: Image) -> Float32:
     """Alpha from a file, (H, W) float32 in [0, 1]; 0 where it is NaN."""
-    plane = read_image(path).plane("A", "Y")
+    plane = stored.plane("A", "Y")
     # Of NaN and a number fmax takes the number.
     np.fmax(plane, 0, out=plane)
     return np.minimum(plane, 1, out=plane)

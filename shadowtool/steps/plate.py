@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Estimator, Gain, Missing, Reading, Steady
 from shadowtool.core.beta import shadow_contrast
+from shadowtool.core.camera_motion import Place
 from shadowtool.core.exposure import common_reference, frame_gain, without_gain
 from shadowtool.core.half_floats import not_finite, shortened
 from shadowtool.core.holdout import (
@@ -35,14 +36,15 @@ from shadowtool.core.robust_plates import (
     keyed,
 )
 from shadowtool.core.trembling import UNSTEADY, strips, tremble
-from shadowtool.errors import DamagedFileError, InputError, OptionError
+from shadowtool.errors import DamagedFileError, InputError, MissingError, OptionError
 from shadowtool.io.files import fingerprint_file, make_folder, new_folders, real
 from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
 from shadowtool.io.products import MANIFEST, confidence_layers, plate_files
-from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
+from shadowtool.io.sequence import Frame, Sequence, frame_file, frame_range, open_sequence
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import (
     Footage,
+    moved_with,
     open_footage,
     require_frames,
     require_size,
@@ -54,10 +56,10 @@ from shadowtool.steps.run import (
     Recipe,
     Result,
     Run,
-    decodes,
     refuse_existing,
     refuse_inputs,
     refuse_other_step,
+    say_skipped,
     unchanged,
     warn_of_left,
     warn_of_nan,
@@ -131,18 +133,19 @@ def plate(
     marked = None if plane is None else read_plane(plane, footage.header)
 
     written = [_place(output / HOLDOUT_FOLDER, frame) for frame in frames] if automatic else []
+    refuse_other_step("plate", output, run)
     refuse_existing([*plate_files(output), output / MANIFEST, *written], run)
     read = [Path(plane)] if plane else []
     for sequence in filter(None, (footage.sequence, held)):
         read += sequence.files.values()
     refuse_inputs([*plate_files(output), *written], read)
-    refuse_other_step("plate", output, run)
     inputs = {"frames": Path(footage.sequence.pattern).name}
     shared = list[str]()
     if marked is not None:
         inputs["--plane"] = marked.name
         shared = [marked.mark]
     parameters = {
+        "frames": frame_range(frames),
         "estimator": estimator,
         "read-as": read_as,
         "transfer": footage.transfer,
@@ -157,7 +160,7 @@ def plate(
             try:
                 read = [sequence.path(frame) for sequence in (footage.sequence, held) if sequence]
                 return [fingerprint_file(path) for path in read]
-            except InputError:
+            except MissingError:
                 if run.missing == "skip":
                     return []
                 raise
@@ -165,9 +168,19 @@ def plate(
         known = dict(zip(frames, ordered_map(fingerprints, frames, run.jobs), strict=True))
         mark = recipe.fingerprint([*shared, *chain.from_iterable(known.values())])
         figures = unchanged(output, plate_files(output), mark)
-        kept = written if figures and figures.get("held_out") == HOLDOUT_FOLDER else []
-        if figures is not None and all(ordered_map(decodes, kept, run.jobs)):
-            used = [frame for frame in frames if known[frame]]
+        used = [frame for frame in frames if known[frame]]
+
+        def held_out(frame: Frame) -> bool:
+            try:
+                header = read_image(_place(output / HOLDOUT_FOLDER, frame)).header
+            except InputError:
+                return False
+            # What has no mark somebody has corrected.
+            own = recipe.fingerprint(known[frame][:1])
+            return header.provenance.get("fingerprint", own) == own
+
+        kept = used if figures and figures.get("held_out") == HOLDOUT_FOLDER else []
+        if figures is not None and all(ordered_map(held_out, kept, run.jobs)):
             skipped = [*absent, *(frame for frame in frames if not known[frame])]
             return Result("plate", output, used, len(used), skipped, figures)
     take = _Take(
@@ -178,7 +191,7 @@ def plate(
         parameters["steady"] == "auto",
         {"card": True, "plane": False}.get(read_as),
         output / HOLDOUT_FOLDER,
-        recipe.provenance(recipe.fingerprint([])),
+        recipe,
     )
     with new_folders([output]):
         if estimator == "minmax":
@@ -225,13 +238,14 @@ def plate(
     if take.trembling is not None:
         figures["trembling"] = round(take.trembling, 3)
         if take.trembling > UNSTEADY:
+            cure = "--steady auto" if estimator == "robust" else "--estimator robust"
             logger.warning(
                 "%s: the camera trembles by %.2f pixels; %s",
                 footage.sequence.pattern,
                 take.trembling,
-                "plates are off where texture is strong; hold it firmly, or give --steady auto"
-                if take.footage.vantage is None
-                else "frames are moved to one place",
+                "frames are moved to one place"
+                if take.footage.vantage is not None
+                else f"plates are off where texture is strong; hold it firmly, or give {cure}",
             )
     if figures.get("shaded") == 0:
         logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
@@ -279,14 +293,16 @@ class _Shown(NamedTuple):
     keys: Keyed | None
     marks: list[str]
     gain: float
+    place: Place
 
 
 class _Kept(NamedTuple):
-    """A frame as it was read, and its grid."""
+    """A frame as it was read, its grid, and where it was moved."""
 
     values: NDArray[np.floating]
     grid: NDArray[np.float32]
     mark: str
+    place: Place
 
 
 @dataclass
@@ -307,6 +323,7 @@ class _Take:
         trembling: by how much the camera's place varies, pixels; None where it wasn't measured.
         not_finite: how many of their pixels are NaN or infinite.
         folder: where the automatic one is written.
+        recipe: what decides the result.
     """
 
     footage: Footage
@@ -316,7 +333,7 @@ class _Take:
     steady: bool
     card: bool | None
     folder: Path
-    provenance: dict[str, str]
+    recipe: Recipe
     background: Background | None = None
     reference: NDArray[np.float32] | None = None
     kept: dict[Frame, _Kept] = field(default_factory=dict)
@@ -364,10 +381,11 @@ class _Take:
         def read(frame: Frame) -> _Shown | None:
             try:
                 if frame in self.kept:
-                    values, grid, mark = self.kept.pop(frame) if last else self.kept[frame]
+                    values, grid, mark, place = self.kept.pop(frame) if last else self.kept[frame]
                 else:
                     image = self.footage.image(frame)
-                    values, mark = self.footage.light(image), image.fingerprint
+                    values, place = self.footage.light(image)
+                    mark = image.fingerprint
                     needed = not last or self.reference is not None or self.background is not None
                     grid = self.grid(values) if needed else _NO_GRID
                 gain = self.gain(frame, grid)
@@ -379,13 +397,16 @@ class _Take:
                 if self.held is not None:
                     matte = self._given(self.held.path(frame))
                     marks.append(matte.fingerprint)
-                    holdout = matte.plane("A", "Y")
+                    holdout = moved_with(matte.plane("A", "Y"), matte.header, place)
                 elif self.background is not None:
                     holdout = self.automatic(frame, grid, last)
                     if last:
-                        write_png(_place(self.folder, frame), holdout, self.provenance)
-            except InputError:
+                        own = self.recipe.provenance(self.recipe.fingerprint([mark]))
+                        write_png(_place(self.folder, frame), holdout, own)
+            except MissingError as error:
                 if self.run.missing == "skip":
+                    if last:
+                        say_skipped(error)
                     return None
                 raise
             keys = keyed(values, holdout) if with_keys else None
@@ -395,7 +416,7 @@ class _Take:
                     values = _NOTHING
                 else:
                     keys = keys._replace(keys=_NOTHING.view(np.int16))
-            return _Shown(values, grid, holdout, keys, marks, gain)
+            return _Shown(values, grid, holdout, keys, marks, gain, place)
 
         yield from ordered_map(read, frames, self.run.jobs)
 
@@ -467,7 +488,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         grids[frame] = item.grid
         if item.values.nbytes <= free:
             free -= item.values.nbytes
-            take.kept[frame] = _Kept(item.values, item.grid, item.marks[0])
+            take.kept[frame] = _Kept(item.values, item.grid, item.marks[0], item.place)
         elif with_levels:
             grays[frame] = keyed(item.values, item.holdout).gray
     noise = noise_model(noise_levels(thinned))

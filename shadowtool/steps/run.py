@@ -11,7 +11,7 @@ from typing import Any
 
 from shadowtool import __version__
 from shadowtool.choices import Missing
-from shadowtool.errors import InputError, OptionError, OutputExistsError
+from shadowtool.errors import InputError, MissingError, OptionError, OutputExistsError
 from shadowtool.io.files import fingerprinted, is_file, new_folders, real
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
@@ -61,11 +61,14 @@ class Recipe:
         parameters: values that JSON can hold; no paths, no number of jobs.
         inputs: what was read, as a person would name it, by option (numbered, ``--scan 2``, if it
             is given more than once), or by a word of its own for an argument.
+        transfers: the transfer functions that inputs were taken to have, by option, where no
+            parameter says it.
     """
 
     step: str
     parameters: Mapping[str, Any]
     inputs: Mapping[str, str]
+    transfers: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def command(self) -> str:
@@ -139,6 +142,18 @@ def refuse_other_step(step: str, output: Path, run: Run) -> None:
         )
 
 
+def refuse_other_format(output: Path, name: str, suffix: str) -> None:
+    """Stop before frames are put beside frames of the same name in another format: who reads the
+    folder could not tell which are meant.
+
+    Raises:
+        OutputExistsError: there are some.
+    """
+    for file in sorted(output.iterdir()) if output.is_dir() else []:
+        if file.name.startswith(f"{name}.") and file.suffix in {EXR, PNG} - {suffix}:
+            raise OutputExistsError(f"{file}: a frame in another format; give another folder")
+
+
 def name_of_frames(output: Path) -> str:
     """What frames that are written right into a folder are called: as it is.
 
@@ -187,8 +202,8 @@ class FrameWork:
             absent: frames that are missing from the input.
             summary: from the figures of all the frames that the manifest knows.
         """
-        refuse_existing((file for frame in frames for file in self.products(frame)), run)
         refuse_other_step(self.recipe.step, self.output, run)
+        refuse_existing((file for frame in frames for file in self.products(frame)), run)
         folders = {file.parent for frame in frames for file in self.products(frame)}
         rows: dict[str, Figures] = {}
         skipped, kept = list(absent), 0
@@ -219,8 +234,9 @@ class FrameWork:
                 if run.resume and (figures := current(self.products(frame), mark)) is not None:
                     return {"fingerprint": mark, **figures}, True
                 figures = self.make(frame, self.recipe.provenance(mark))
-        except InputError:
+        except MissingError as error:
             if run.missing == "skip":
+                say_skipped(error)
                 return None
             raise
         return {"fingerprint": mark, **figures}, False
@@ -299,6 +315,11 @@ def refuse_inputs(products: Iterable[Path], sources: Iterable[Path]) -> None:
                 raise OptionError(f"{file}: is to be read, not written over; give another -o")
 
 
+def say_skipped(error: MissingError) -> None:
+    """Say why a frame is skipped."""
+    logger.warning("skipped: %s", error)
+
+
 def warn_of_left(files: Iterable[Path]) -> None:
     """Name files that an earlier run wrote and this one did not, if they are there."""
     if left := [file for file in files if is_file(file)]:
@@ -340,15 +361,6 @@ def current(files: list[Path], mark: str) -> Figures | None:
     return figures
 
 
-def decodes(file: Path) -> bool:
-    """Whether a picture is there and whole."""
-    try:
-        read_image(file)
-    except InputError:
-        return False
-    return True
-
-
 def unchanged(output: Path, products: Iterable[Path], mark: str) -> Figures | None:
     """For steps with one result: the figures of an earlier run that can be kept, else None."""
     manifest = read_record(output / MANIFEST)
@@ -382,6 +394,7 @@ def write_manifest(
         "command": recipe.command,
         "parameters": dict(recipe.parameters),
         "inputs": dict(recipe.inputs),
+        **({"transfers": dict(recipe.transfers)} if recipe.transfers else {}),
         "fingerprint": mark,
         "figures": figures,
     }

@@ -40,11 +40,11 @@ from shadowtool.core.shadow_time import (
 )
 from shadowtool.core.trembling import UNSTEADY, strips, tremble
 from shadowtool.core.warp_map import Pass
-from shadowtool.errors import DamagedFileError, InputError, ReshootError
+from shadowtool.errors import DamagedFileError, InputError, MissingError, ReshootError
 from shadowtool.io.files import fingerprint_file, make_folder
 from shadowtool.io.image import write_png
 from shadowtool.io.products import LINES, MANIFEST, SCAN, encode_times, write_scan
-from shadowtool.io.sequence import Frame
+from shadowtool.io.sequence import Frame, frame_range
 from shadowtool.parallel import meanwhile, ordered_map
 from shadowtool.steps.footage import Footage, open_footage, say_assumed
 from shadowtool.steps.plane import read_plane
@@ -56,6 +56,7 @@ from shadowtool.steps.run import (
     refuse_existing,
     refuse_inputs,
     refuse_other_step,
+    say_skipped,
     unchanged,
     warn_of_nan,
     write_manifest,
@@ -119,14 +120,19 @@ def scan(
         raise InputError(f"{footage.sequence.pattern}: {len(frames)} frames make no sweep")
     region, plane_name, plane_mark = read_plane(plane, footage.header)
     products = [output / SCAN, output / LINES, output / PICTURE]
+    refuse_other_step("scan", output, run)
     refuse_existing([*products, output / MANIFEST], run)
     refuse_inputs(products, [*footage.sequence.files.values(), Path(plane)])
     recipe = Recipe(
         "scan",
-        {"gain": gain, "steady": steady, "transfer": footage.transfer},
+        {
+            "frames": frame_range(frames),
+            "gain": gain,
+            "steady": steady,
+            "transfer": footage.transfer,
+        },
         {"frames": Path(footage.sequence.pattern).name, "--plane": plane_name},
     )
-    refuse_other_step("scan", output, run)
     if run.resume:
         paths = [footage.sequence.path(frame) for frame in frames]
         known = dict(zip(frames, ordered_map(fingerprint_file, paths, run.jobs), strict=True))
@@ -236,8 +242,9 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
     def read(position: int) -> _Seen | None:
         try:
             image = footage.image(frames[position], apart=True)
-        except DamagedFileError:
+        except MissingError as error:
             if run.missing == "skip":
+                say_skipped(error)
                 return None
             raise
         colours = image.colours(footage.transfer)

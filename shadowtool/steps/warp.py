@@ -195,6 +195,9 @@ class _Scans:
 
 
 def _open_scans(folders: list[Path], beside: tuple[Header, str] | None = None) -> _Scans:
+    for position, folder in enumerate(folders):
+        if any(real(folder) == real(other) for other in folders[:position]):
+            raise OptionError(f"{folder}: is given twice; give each scan once")
     read = [read_scan(folder) for folder in folders]
     header, name = beside or (read[0][1], str(folders[0]))
     for folder, (_, other, _) in zip(folders, read, strict=True):
@@ -207,6 +210,7 @@ def _solve(
 ) -> Result:
     target = _open_scans(scans)
     source = _open_scans(source_scans, (target.header, str(scans[0]))) if source_scans else None
+    refuse_other_step("warp", output, run)
     refuse_existing([output / WARP, output / MANIFEST], run)
     inputs = {f"scan {i}": name for i, name in enumerate(target.names, start=1)}
     marks = list(target.marks)
@@ -214,7 +218,6 @@ def _solve(
         inputs |= {f"--source-scan {i}": name for i, name in enumerate(source.names, start=1)}
         marks += ["source", *source.marks]
     recipe = Recipe("warp", {"iterations": iterations}, inputs)
-    refuse_other_step("warp", output, run)
     mark = recipe.fingerprint(marks)
     if run.resume:
         figures = unchanged(output, [output / WARP, output / PICTURE], mark)

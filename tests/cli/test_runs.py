@@ -630,6 +630,109 @@ def test_frames_of_another_movie_are_named(movie, command, tmp_path):
     assert "frames 1004-1005 are left from an earlier run" in outcome.err
 
 
+@pytest.mark.parametrize("again", ["--overwrite", "--resume"])
+def test_frames_under_their_former_numbers_are_named(movie, command, tmp_path, again):
+    output = tmp_path / "take"
+    assert command("capture", movie, "-o", output).code == 0
+    outcome = command("capture", movie, "-o", output, "--start", "1", again)
+    assert outcome.code == 0
+    assert "frames 1001-1005 are left from an earlier run" in outcome.err
+    record = json.loads((output / "shadowtool.json").read_text())
+    assert sorted(record["frames"]) == ["1", "2", "3", "4", "5"]
+
+
+@pytest.mark.parametrize("name", ["plate", "scan"])
+def test_a_record_says_of_which_frames_the_result_is(name, shot, command, tmp_path, monkeypatch):
+    words = shot.arguments(name)
+    folder = Path(words[1])
+    if name == "plate":
+        # The pattern itself may say which files are meant.
+        words[1] = f"{folder}/{folder.name}.1001-1005#.exr"
+    else:
+        words += ["--frames", "1001-1018"]
+    assert command(*words, "-o", tmp_path / "out").code == 0
+    record = json.loads((tmp_path / "out" / "shadowtool.json").read_text())
+    _, *again = shlex.split(record["command"])
+    monkeypatch.chdir(folder)
+    assert command(*again, "-o", tmp_path / "again").code == 0
+    for file in sorted((tmp_path / "out").glob("*.exr")):
+        assert file.read_bytes() == (tmp_path / "again" / file.name).read_bytes()
+
+
+def test_a_composite_in_another_format_is_not_put_beside_the_first(shot, command, tmp_path):
+    """Whoever reads the folder next could not tell which of the two is meant."""
+    words = [*shot.arguments("composite"), "-o", tmp_path / "out"]
+    assert command(*words, "--format", "png").code == 0
+    for option in ("--overwrite", "--resume"):
+        outcome = command(*words, "--format", "exr", option)
+        assert outcome.code == 1
+        assert "another format" in outcome.err
+    assert not list((tmp_path / "out").glob("out.*.exr"))
+
+
+def test_a_frame_that_is_skipped_is_named_with_the_reason(shot, command, tmp_path):
+    damaged = tmp_path / "source"
+    shutil.copytree(shot.source, damaged)
+    file = damaged / "source.1003.exr"
+    file.write_bytes(file.read_bytes()[:-30])
+    words = ["matte", damaged, "--plates", shot.plates, "-o", tmp_path / "matte"]
+    outcome = command(*words, "--missing", "skip")
+    assert outcome.code == 3
+    assert "source.1003.exr: damaged or cut off" in outcome.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("composite", "{matte}", "--fg", "{matte}/trimap", "--plates", "{plates}"),
+        ("plate", "{source}", "--holdout", "{source}"),
+        ("matte", "{source}", "--plates", "{plates}", "--alpha", "{source}"),
+    ],
+)
+def test_what_can_never_do_is_not_skipped(words, shot, command, tmp_path):
+    """Absent and damaged frames are; a wrong input is wrong in every frame."""
+    words = [
+        word.format(matte=shot.matte, plates=shot.plates, source=shot.source) for word in words
+    ]
+    plain = command(*words, "-o", tmp_path / "plain")
+    skipping = command(*words, "-o", tmp_path / "skipping", "--missing", "skip")
+    assert plain.code == skipping.code == 1
+    assert plain.err == skipping.err
+
+
+@pytest.mark.parametrize("name", ["plate", "matte", "scan", "warp", "composite"])
+def test_another_steps_folder_is_not_offered_to_be_written_over(name, shot, command, tmp_path):
+    output = tmp_path / "out"
+    assert command("capture", shot.source, "-o", output).code == 0
+    # As if products of this step were there, too.
+    for file in ("lit.exr", "scan.exr", "warp.exr", "trimap/trimap.1001.png"):
+        (output / file).parent.mkdir(exist_ok=True)
+        (output / file).write_bytes(b"")
+    outcome = command(*shot.arguments(name), "-o", output)
+    assert outcome.code == 1
+    assert "is the record of capture; give another folder" in outcome.err
+
+
+def test_a_scan_given_twice_is_refused(shot, command, tmp_path):
+    scans = [shot.scan1, shot.scan2, tmp_path / "linked"]
+    scans[2].symlink_to(shot.scan1)
+    outcome = command("warp", *scans, "-o", tmp_path / "out")
+    assert outcome.code == 2
+    assert f"{scans[2]}: is given twice" in outcome.err
+
+
+def test_holdouts_of_other_frames_are_not_kept(shot, command, tmp_path):
+    output = tmp_path / "out"
+    words = ["plate", shot.source, "-o", output]
+    assert command(*words).code == 0
+    holdouts = sorted((output / "holdout").iterdir())
+    before = [file.read_bytes() for file in holdouts]
+    assert before[0] != before[-1]
+    holdouts[0].write_bytes(before[-1])
+    assert command(*words, "--resume").code == 0
+    assert [file.read_bytes() for file in holdouts] == before
+
+
 def test_chunks_of_the_same_leave_nothing(shot, command, tmp_path):
     words = [*shot.arguments("matte"), "-o", tmp_path / "out"]
     for frames in ("1001-1003", "1004-1006"):

@@ -153,7 +153,7 @@ def test_a_surface_keeps_its_own_shadow_through_noise() -> None:
 
 
 def test_a_few_pixels_in_one_partial_shadow_are_no_surface() -> None:
-    """Where a thin shadow went by in few frames some pixels were darkened alike, but not in full."""
+    """Where a thin shadow went by in few frames some pixels darken alike, in part."""
     reached = band()
     for column in range(10, 150, 30):
         reached[37:52, column : column + 15] = 0.5

@@ -103,3 +103,9 @@ def test_two_sides_are_merged_by_how_surely_each_is_known(
 def test_large_pictures_are_looked_at_small() -> None:
     assert flow_picture(np.zeros((1080, 1920, 3), np.float16)).shape == (270, 480)
     assert flow_picture(np.zeros((8, 6, 3), np.float32)).shape == (16, 16)
+
+
+def test_the_small_picture_is_the_same_in_any_exposure() -> None:
+    dim, bright = (flow_picture(frame(0) * np.float32(scale)) for scale in (0.02, 64))
+    assert np.abs(dim.astype(int) - bright).max() <= 1
+    assert 100 < np.median(dim) < 250

@@ -1,5 +1,6 @@
 """From swept frames on disk to W, on the analytic scene."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -191,9 +192,10 @@ def test_a_single_source_scan_is_refused(scans: list[Path], tmp_path: Path) -> N
 
 
 def test_parallel_source_scans_are_to_be_shot_again(scans: list[Path], tmp_path: Path) -> None:
+    again = shutil.copytree(scans[0], tmp_path / "again")
     with pytest.raises(ReshootError, match="degrees apart"):
-        warp(scans, tmp_path, source_scans=[scans[0], scans[0]])
-    assert not any(tmp_path.iterdir())
+        warp(scans, tmp_path / "out", source_scans=[scans[0], again])
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_source_that_shows_none_of_the_targets_ground_is_to_be_shot_again(

@@ -144,7 +144,7 @@ def test_a_keyframe_is_carried_forwards_and_backwards(
     drawings = open_sequence(tmp_path / "drawn")
     keyframes = Keyframes.of(drawings, open_footage(take / "source"), "error")
     # Without the mark in the corner.
-    trimap, alpha = keyframes.trimap(number)[8:], figure(number).alpha[8:]
+    trimap, alpha = keyframes.trimap(number, (0.0, 0.0))[8:], figure(number).alpha[8:]
     assert (alpha[trimap == FIGURE] > 0).mean() > 0.97
     assert (alpha[trimap == BACKGROUND] < 1).mean() > 0.99
     assert (trimap == FIGURE).sum() > 0.5 * alpha.sum()

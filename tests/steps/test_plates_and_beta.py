@@ -311,6 +311,68 @@ def test_a_matte_that_is_given_is_moved_with_its_frame(tmp_path: Path) -> None:
     assert still < 0.5 * trembling
 
 
+def test_our_own_mattes_lie_where_the_plates_do_and_are_not_moved_again(tmp_path: Path) -> None:
+    take, places = trembling_take(tmp_path, 0.2)
+    columns = np.arange(320.0)
+    roto = write_mattes(
+        tmp_path / "roto",
+        (np.tile(np.clip(10.5 - np.abs(columns - x - 160), 0, 1), (240, 1)) for x, _ in places),
+    )
+    plates = tmp_path / "plates"
+    plate(take, plates, holdout="none")
+    matte(take, tmp_path / "one", plates=plates, alpha=roto)
+    matte(take, tmp_path / "two", plates=plates, alpha=tmp_path / "one" / "fg")
+    for n in range(len(places)):
+        one, two = (
+            read_image(tmp_path / f"{name}/fg/fg.{FIRST + n}.exr").channel("A")
+            for name in ("one", "two")
+        )
+        assert np.array_equal(one, two)
+
+
+def test_a_trimap_that_is_drawn_is_moved_with_its_frame(tmp_path: Path) -> None:
+    """A camera that is knocked; trimaps are drawn on what it saw."""
+    columns = np.arange(320.0)
+    places = [0.0] * 10 + [4.0] * 6
+    colour = np.float32([1, 0.8, 0.6])
+    shots, drawn = [], []
+    for number, x in enumerate(places):
+        shot = (waves(x, 0) * (0.3 + 0.7 * passing_beta(number, x)))[..., None] * colour
+        away = np.abs(columns - x - 160)
+        shot[:, away < 10] = (0.1, 0.6, 0.1)
+        shots.append(shot.astype(np.float16))
+        level = np.select([away < 7, away < 14], [255, 128], 0)
+        drawn.append(np.tile(level / 255, (240, 1)))
+    take = write_frames(tmp_path / "take", iter(shots))
+    trimaps = write_mattes(tmp_path / "drawn", drawn)
+    plates, out = tmp_path / "plates", tmp_path / "matte"
+    plate(take, plates)
+    assert matte(take, out, plates=plates, trimap=trimaps).figures["moved"] > 3
+    # The plates are where the camera was most of the time.
+    for number in (FIRST, FIRST + 15):
+        trimap = read_image(out / f"trimap/trimap.{number}.png").plane("Y")[120]
+        middle = np.mean(np.flatnonzero(trimap == 1))
+        assert abs(middle - 160) < 0.8
+        assert set(np.round(255 * np.unique(trimap))) == {0, 128, 255}
+
+
+def test_a_holdout_that_is_given_is_moved_with_its_frame(tmp_path: Path) -> None:
+    """A camera that is knocked, and then something is held out where it saw it."""
+    columns = np.arange(320.0)
+    places = [0.0] * 10 + [4.0] * 6
+    shots, held = [], []
+    for x in places:
+        shots.append(np.repeat(waves(x, 0)[..., None], 3, axis=-1).astype(np.float16))
+        inside = (np.abs(columns - x - 160) < 20) & (x > 0)
+        held.append(np.tile(inside.astype(float), (240, 1)))
+    take = write_frames(tmp_path / "take", iter(shots))
+    plate(take, tmp_path / "plates", holdout=write_mattes(tmp_path / "roto", held))
+    frames = read_image(tmp_path / "plates/confidence.exr").channel("frames")[120]
+    inside = np.abs(columns - 160)
+    assert frames[inside < 18].max() == 10
+    assert np.median(frames[(inside > 22) & (inside < 26)]) == 16
+
+
 def test_a_moved_frame_is_the_same_in_any_chunk(tmp_path: Path) -> None:
     take, _ = trembling_take(tmp_path, 0.2)
     plate(take, tmp_path / "plates")

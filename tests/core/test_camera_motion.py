@@ -46,6 +46,14 @@ def test_a_picture_without_texture_tells_nothing() -> None:
     assert shift(prepare(blank), prepare(blank), 100) is None
 
 
+def test_next_to_no_texture_tells_nothing() -> None:
+    """What a codec makes of it goes with whatever passes."""
+    faint = (0.5 * np.exp(0.02 * (ground() - 0.5))).astype(np.float32)
+    dragged = moved(faint, 0.6, 0.0)
+    assert shift(prepare(faint), prepare(dragged), 320) is None
+    assert Vantage.of(faint).off(dragged) == (0.0, 0.0)
+
+
 def test_grain_that_shows_one_direction_only_is_no_movement() -> None:
     rng = np.random.default_rng(3)
     rows = np.repeat(rng.uniform(0.2, 0.6, (120, 1)), 200, axis=1)

@@ -22,8 +22,8 @@ _TILES = 4, 3
 _LEAST_TILE = 24
 # A tile whose correlation is below this shows something else than before.
 _LEAST_CORRELATION = 0.5
-# Of less contrast than this, as a logarithm, a tile shows nothing: what a codec makes of it moves with
-# what passes, and where it is off by parts of a pixel nobody sees it.
+# Of less contrast than this, as a logarithm, a tile shows nothing: what a codec makes of it moves
+# with what passes, and where it is off by parts of a pixel nobody sees it.
 _LEAST_DETAIL = 1e-2
 # Displacements are looked for in pictures smaller by these, one after the other; in so many steps
 # each at most, till one is shorter than this, pixels.

@@ -70,6 +70,10 @@ class Weighed:
 
     def line_distance(self, lit: Float32, shadow: Float32) -> Float32:
         """`line_distance` from S and L, (3, N) each, to (N,)."""
+        return self.nearest(lit, shadow)[0]
+
+    def nearest(self, lit: Float32, shadow: Float32) -> tuple[Float32, Float32]:
+        """The same, and where on the line the nearest point is: 0 at S, 1 at L; (N,) each."""
         with np.errstate(invalid="ignore", over="ignore"):
             direction = lit - shadow
             direction *= self._weight
@@ -83,7 +87,7 @@ class Weighed:
             distance = np.sqrt(_dot(rest, rest))
         # Of NaN and a number fmax takes the number.
         np.fmax(distance, 0, out=distance)
-        return np.asarray(np.minimum(distance, 1e6, out=distance), np.float32)
+        return np.asarray(np.minimum(distance, 1e6, out=distance), np.float32), part
 
 
 def _dot(one: Float32, other: Float32) -> Float32:

@@ -47,9 +47,15 @@ _SHADED, _MOST, _AT_ONCE = 0.5, 0.5, 0.2
 # more than a factor.
 _LARGE, _SOMEBODY = 0.09, 0.6
 _BRIGHTER, _COUNTED, _DIFFERS = 0.1, 7.0, 1.35
-# Ranks of samples that are lit: one to compare with, and two whose texture is the ground's. Samples
-# with ratios this much around a frequent one have texture in common with it if they are shadow.
-_RANKS, _AROUND, _LEAST_LIKELY = (0.85, 0.8, 0.95), 0.3, 0.05
+# Ranks of samples that may be lit, of which the one that most samples are as near to as that, as a
+# part, is compared with; and of two whose texture is the ground's. Samples with ratios this much
+# around a frequent one have texture in common with it if they are shadow.
+_BRIGHT_RANKS, _NEXT, _TEXTURE_RANKS = (0.85, 0.7, 0.55), 0.08, (0.8, 0.95)
+_AROUND, _LEAST_LIKELY = 0.3, 0.05
+# Samples of one colour are within so many deviations of it; it is found in so many rounds.
+_CLUSTER, _ROUNDS, _LIGHTEST_RATIO = 2.5, 3, 0.9
+# From the first to the second β a sample is neither in light nor in shade, and counts so much.
+_SHADE_ENDS, _LIGHT_BEGINS, _BETWEEN = 0.15, 0.85, 0.75
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
 # Decided pixels are dropped when no more than this part is left.
@@ -147,8 +153,15 @@ def _on_line(sample: Weighed, lit: Float32, shadow: Float32) -> Bool:
     return np.asarray(sample.line_distance(lit, shadow) <= _ON_LINE)
 
 
-def _ranked(stack: Float32, order: Index, pixels: Index) -> Float32:
-    """The sample that each pixel has in one place of the order; (3, N)."""
+def _rank(ascending: Index, part: float) -> Index:
+    """Each pixel's sample below which this part of its samples are."""
+    order: Index = ascending[int(part * (len(ascending) - 1))]
+    return order
+
+
+def _ranked(stack: Float32, order: Index, pixels: Index | None = None) -> Float32:
+    """The sample that each pixel, or each of some, has in one place of the order; (3, N)."""
+    pixels = np.arange(stack.shape[2]) if pixels is None else pixels
     return np.ascontiguousarray(stack[order[pixels], :, pixels].T)
 
 
@@ -164,10 +177,8 @@ def _common_ratio(
     ground have one ratio, too, but nothing of the ground's texture. Of a shadow that is all but
     black noise leaves no ratio, but then more samples are black than have any one.
     """
-    everywhere = np.arange(stack.shape[2])
-    bright, *others = (
-        _ranked(stack, ascending[int(rank * (len(stack) - 1))], everywhere) for rank in _RANKS
-    )
+    bright = _usually_bright(stack, ascending)
+    others = (_ranked(stack, _rank(ascending, part)) for part in _TEXTURE_RANKS)
     light = bright.sum(axis=0)
     clear = light > _CLEAR * noise.sigma(bright.T).sum(axis=1)
     total = stack.sum(axis=1)
@@ -186,33 +197,69 @@ def _common_ratio(
         away = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2)
         alike = away < _ALIKE
         if alike.sum() >= _TELLING:
-            ratio, scatter, noisy = _told(stack, bright, alike, noise)
+            ratio, pure, noisy = _told(stack, bright, alike, noise)
             lowered = min(float(np.hypot(1, noisy / _ALIKE)), _LOWERED)
             follows = _follows(total, away < _AROUND, textures, size)
-            if (weight := excess[peak] * lowered * follows / scatter) > best:
-                found, best, usual = ratio, weight, alike.sum() / scatter
+            if (weight := excess[peak] * lowered * pure * follows**2) > best:
+                found, best, usual = ratio, weight, alike.sum() * pure
         excess[max(peak - _BINS, 0) : peak + _BINS + 1] = -np.inf
     black = difference <= -_DEEPEST
     if black.sum() > max(_BLACK * usual, _TELLING):
-        found, *_ = _told(stack, bright, black, noise)
+        found = np.clip(np.median(_ratios(stack, bright, black), axis=0), 0, _LIGHTEST_RATIO)
     return found
+
+
+def _usually_bright(stack: Float32, ascending: Index) -> Float32:
+    """Of a pixel's samples that may be lit the one that most others are next to, (3, N): somebody
+    bright is not there for long."""
+    total = stack.sum(axis=1)
+    found = np.zeros(stack.shape[1:], np.float32)
+    most = np.full(stack.shape[2], -1)
+    for part in _BRIGHT_RANKS:
+        candidate = _ranked(stack, _rank(ascending, part))
+        light = candidate.sum(axis=0)
+        near = np.count_nonzero(np.abs(total - light) < _NEXT * light, axis=0)
+        more = near > most
+        found[:, more], most[more] = candidate[:, more], near[more]
+    return found
+
+
+def _ratios(stack: Float32, bright: Float32, chosen: Bool) -> Float32:
+    """Of the chosen samples, (T, N), to what is bright; (M, 3)."""
+    time, pixel = np.nonzero(chosen)
+    light = bright[:, pixel].T
+    # A channel may be black where the colour is not.
+    return np.asarray(stack[time, :, pixel] / np.where(light > 0, light, 1), np.float32)
 
 
 def _told(
     stack: Float32, bright: Float32, chosen: Bool, noise: NoiseModel
 ) -> tuple[Float32, float, float]:
-    """The ratio of the chosen samples, (T, N), to what is bright, (3,); how many times as much as
-    noise and materials explain it scatters, at least 1; and what part of it is noise."""
+    """The ratio of the chosen samples, (T, N), in the colour that most of them have, (3,); what
+    part of them has it; and what part of it is noise."""
     time, pixel = np.nonzero(chosen)
-    own, light = stack[time, :, pixel], bright[:, pixel].T
-    # A channel may be black where the colour is not.
-    ratios = own / np.where(light > 0, light, 1)
-    logarithm = np.log(np.maximum(ratios, 1e-4))
-    off = np.median(np.abs(logarithm - np.median(logarithm, axis=0)), axis=0) / 0.6745
-    noisy = np.median(noise.sigma(own) / np.maximum(own, np.float32(1e-4)), axis=0)
-    scatter = max(float(np.median(off / np.hypot(noisy, _SCATTER))), 1.0)
-    ratio = np.asarray(np.clip(np.median(ratios, axis=0), 0, 0.9), np.float32)
-    return ratio, scatter, float(np.median(noisy))
+    own = stack[time, :, pixel]
+    ratios = _ratios(stack, bright, chosen)
+    logarithm = np.log(np.maximum(ratios, np.float32(1e-4)))
+    noisy = noise.sigma(own) / np.maximum(own, np.float32(1e-4))
+    within = _CLUSTER * np.hypot(noisy, _SCATTER)
+    colour = logarithm - logarithm.mean(axis=1, keepdims=True)
+    inside = (np.abs(colour - _densest(colour, float(np.median(within)))) < within).all(axis=1)
+    for _ in range(_ROUNDS if inside.any() else 0):
+        inside = (np.abs(colour - np.median(colour[inside], axis=0)) < within).all(axis=1)
+    pure = float(inside.mean())
+    ratio = np.median(ratios[inside] if pure else ratios, axis=0)
+    return np.clip(ratio, 0, _LIGHTEST_RATIO), pure, float(np.median(noisy))
+
+
+def _densest(colour: Float32, width: float) -> Float32:
+    """Where most of the colours (M, 3), logarithms that add up to 0, are; (3,)."""
+    bins = np.arange(-1, 1 + width, max(width / 2, 0.01))
+    counts, *_ = np.histogram2d(colour[:, 0], colour[:, 2], bins=(bins, bins))
+    smooth = cv2.GaussianBlur(counts, (0, 0), 1)
+    red, blue = np.unravel_index(int(np.argmax(smooth)), smooth.shape)
+    middle = (bins[:-1] + bins[1:]) / 2
+    return np.array([middle[red], -middle[red] - middle[blue], middle[blue]], np.float32)
 
 
 def _follows(total: Float32, chosen: Bool, textures: list[Float32], size: tuple[int, int]) -> float:
@@ -234,9 +281,11 @@ def _follows(total: Float32, chosen: Bool, textures: list[Float32], size: tuple[
     for axis in (1, 2):
         where = np.moveaxis(chosen.reshape(-1, *size), axis, -1)
         time, row, column = np.nonzero(where[..., 1:] & where[..., :-1])
-        steps = (np.diff(np.moveaxis(values, axis, -1)) for values in logarithms)
-        pairs.append([step[time * (len(step) > 1), row, column] for step in steps])
-    own, one, other = np.hstack(pairs)
+        changes = (np.diff(np.moveaxis(values, axis, -1)) for values in logarithms)
+        pairs.append([change[time * (len(change) > 1), row, column] for change in changes])
+    steps = np.hstack(pairs)
+    # Where the ground itself differs by more only what follows it is among the chosen.
+    own, one, other = steps[:, (np.abs(steps[1:]) < _AROUND / 2).all(axis=0)]
     texture = float(one @ other)
     error = float(np.linalg.norm(own) * np.linalg.norm(other)) / max(len(own), 1) ** 0.5
     if texture <= 2 * error:
@@ -255,7 +304,8 @@ def _most_supported(
     """For each pixel the sample on whose line, as L, most of the samples lie.
 
     That they are spread over the take counts half as much as their number: ground is seen before
-    and after a figure that stops for a while.
+    and after a figure that stops for a while. Samples between L and S count less: before whom that
+    is brighter all ground is as if in a penumbra of his, where most of it is in light or in shade.
     """
     lit = np.zeros(stack.shape[1:], np.float32)
     best = np.full(stack.shape[2], -1, np.float32)
@@ -279,12 +329,15 @@ def _most_supported(
 
 
 def _support(samples: list[Weighed], lit: Float32, shadow: Float32) -> Float32:
-    """How many samples lie on each pixel's line, and half the time between first and last."""
+    """How many samples lie on each pixel's line, those between its ends for less, and half the time
+    between first and last."""
     end = np.float32(len(samples))
     votes, first, last = (np.zeros(lit.shape[1], np.float32) for _ in range(3))
     for time, sample in enumerate(samples):
-        vote = _on_line(sample, lit, shadow).astype(np.float32)
-        votes += vote
+        distance, part = sample.nearest(lit, shadow)
+        vote = (distance <= _ON_LINE).astype(np.float32)
+        between = (part > _SHADE_ENDS) & (part < _LIGHT_BEGINS)
+        votes += vote * (1 - between * np.float32(1 - _BETWEEN))
         # How early, counted from the end, so that 0 is none for either.
         np.maximum(first, vote * (end - np.float32(time)), out=first)
         np.maximum(last, vote * np.float32(time), out=last)

@@ -58,7 +58,8 @@ def shadow_ratio_field(
         (H, W, 3) float32 and the spread of log ratios; None if nothing was shaded in full.
     """
     gray = _log_ratio(channel_sum(lit), channel_sum(shadow))
-    return _ratio_field(lit, shadow, gray, _level(gray, _usual(gray), frames), plane)
+    level = _opened(_level(gray, _usual(gray), frames))
+    return _ratio_field(lit, shadow, gray, level, plane)
 
 
 def _level(gray: Float32, usual: Float32, frames: NDArray[np.uint32], least: int = _FIRM) -> Bool:
@@ -79,7 +80,7 @@ def _usual(gray: Float32) -> Float32:
 def _ratio_field(
     lit: Float32, shadow: Float32, gray: Float32, level: Bool, plane: Bool | None
 ) -> tuple[Float32, float] | None:
-    where = _looked_at(_opened(level if plane is None else level & plane))
+    where = _looked_at(level if plane is None else level & plane)
     if where.size < 50:
         return None
     own = gray.ravel().take(where)
@@ -152,16 +153,21 @@ def complete_shadow(
     usual = _usual(gray)
     with np.errstate(invalid="ignore"):
         alone = np.abs(gray - usual) > _COMMON
-    # In a take of few frames no shadow stays for several.
-    for least in (_FIRM, 1):
-        level = _level(gray, usual, frames, least)
-        if (found := _ratio_field(lit, shadow, gray, level, plane)) is not None:
+    # In a take of few frames no shadow stays for several, and a thin one is level nowhere.
+    often = (frames >= _FIRM) & np.isfinite(gray)
+    thin = often & ~_opened(often, 2 * _cell(dark.shape) + 1)
+    for surface in (
+        _opened(_level(gray, usual, frames)),
+        _opened(_level(gray, usual, frames, 1)),
+        _opened(thin, 3),
+    ):
+        if (found := _ratio_field(lit, shadow, gray, surface, plane)) is not None:
             break
     result = np.asarray(cv2.copyTo(shadow, dark.view(np.uint8), lit.copy()), np.float32)
     if found is None:
         return Completed(result, np.asarray(dark, np.float32), plane is not None)
     expected, spread = found
-    surface, missed = _opened(level), np.zeros_like(dark)
+    missed = np.zeros_like(dark)
     if not partial:
         missed = _missed_by_the_card(lit, seen, dark, expected)
     common = np.log(channel_sum(expected) / 3)
@@ -226,9 +232,9 @@ def _missed_by_the_card(lit: Float32, looked_at: Bool, dark: Bool, ratio: Float3
     return np.asarray((whole > 0) & never)
 
 
-def _opened(mask: Bool) -> Bool:
+def _opened(mask: Bool, width: int = 5) -> Bool:
     """A mask without what is narrower than a few pixels: noise that looks like a shadow."""
-    small = np.ones((5, 5), np.uint8)
+    small = np.ones((width, width), np.uint8)
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
 
 

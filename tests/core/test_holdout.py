@@ -28,6 +28,7 @@ ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH].astype(float)
 MANY = ((0.2, (0.55, 0.33, 0.24)), (0.6, (0.10, 0.35, 0.75)), (0.95, (0.75, 0.7, 0.1)))
 DARK = ((0.2, (0.30, 0.16, 0.10)), (0.6, (0.018, 0.018, 0.022)), (0.95, (0.03, 0.026, 0.024)))
 VELVET = ((1.0, (0.004, 0.004, 0.004)),)
+RATIO = np.array([0.18, 0.23, 0.3])
 Walk = Callable[[int], float]
 Clothes = tuple[tuple[float, tuple[float, float, float]], ...]
 
@@ -197,17 +198,36 @@ def test_plain_dark_clothes_that_fill_much_of_a_picture_are_no_shadow(
     rng = np.random.default_rng(0)
     texture = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 1)
     lit = 0.4 * np.exp(grain / texture.std() * texture)[..., None] * np.array([1.05, 1.0, 0.9])
-    ratio = np.array([0.18, 0.23, 0.3])
     frames = []
     for number in range(0, FRAMES, 2):
         x = -30 + 300 * number / (FRAMES - 1)
-        image = lit * (ratio + shadow_beta(x)[..., None] * (1 - ratio))
+        image = lit * (RATIO + shadow_beta(x)[..., None] * (1 - RATIO))
         figure = np.hypot((COLUMNS - x) / 40, (ROWS - 50) / 58) < 1
         image[figure] = clothes * np.array([1.0, 0.9, 0.95])
         frames.append(SCENE.noisy(image.astype(np.float32), number))
     background = find_background(frames, NOISE)
     found = np.median((background.shadow / background.lit)[110:], axis=(0, 1))
-    assert found == pytest.approx(ratio, rel=0.05)
+    assert found == pytest.approx(RATIO, rel=0.05)
+
+
+def test_bright_clothes_in_the_grounds_colour_make_no_shade_of_the_ground() -> None:
+    """Were they lit ground, all that is seen without them would be ground in a penumbra."""
+    frames, alphas = [], []
+    for number in range(FRAMES):
+        x = steadily(number)
+        image = SCENE.lit * (0.25 + 0.75 * shadow_beta(x)[..., None])
+        alphas.append(figure_alpha(x) > 0.5)
+        image = np.where(alphas[-1][..., None], 2.2 * SCENE.lit, image)
+        frames.append(SCENE.noisy(image.astype(np.float32), number))
+    chosen = np.linspace(0, FRAMES - 1, SAMPLES).round().astype(int)
+    background = find_background([frames[i] for i in chosen], NOISE)
+    off = np.abs(np.log(background.lit / SCENE.lit)).max(axis=-1)
+    assert np.mean(off < 0.1) > 0.98
+    held = [
+        figure_mask(frame, background)[alpha].mean()
+        for frame, alpha in zip(frames, alphas, strict=True)
+    ]
+    assert np.mean(held) > 0.95
 
 
 def test_a_surface_that_shade_makes_darker_than_others_is_background_too() -> None:

@@ -152,6 +152,16 @@ def test_a_surface_keeps_its_own_shadow_through_noise() -> None:
     assert np.median(take.error(found.shadow)[inside]) < 0.1
 
 
+def test_a_thin_shadow_tells_the_ratio_too() -> None:
+    """Somebody slow, under a low sun."""
+    reached = np.minimum(smoothstep((np.abs(ROWS - 40) - 1.5) / 2), 1)
+    take = crossed(RATIO, reached)
+    found = take.completed()
+    assert found.partial
+    beyond = take.frames == 0
+    assert np.median(take.error(found.shadow)[beyond]) < 0.1
+
+
 def test_a_few_pixels_in_one_partial_shadow_are_no_surface() -> None:
     """Where a thin shadow went by in few frames some pixels darken alike, in part."""
     reached = band()

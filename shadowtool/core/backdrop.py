@@ -7,6 +7,7 @@ some of the sky from, or whose S is only guessed.
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,10 @@ Places = tuple[slice, ...] | tuple[NDArray[np.intp], ...]
 
 # How much of S may be missing near to what stands on it.
 _DEEPEST = 0.5
+# So far from all shade, as a part of the picture's longer side, hardly more than a part is missing.
+_FROM_SHADE, _HARDLY = 1 / 30, 0.12
+# What is narrower, pixels, is no shade but noise.
+_SPECKS = 5
 # How exact plates are, as a part of their value.
 _TOLERANCE = 0.01
 
@@ -36,6 +41,22 @@ class Nearest(NamedTuple):
     from_lit2: Float32
 
 
+def missing_shade(shadow_frames: NDArray[np.uint32]) -> Float32:
+    """How much of S is usually missing, a standard deviation as a part of it, (H, W).
+
+    Near to where a shadow fell there stood what casts it, and takes some of the sky from the
+    ground; infinite there. Where none ever was what is darker than S is no ground.
+
+    Args:
+        shadow_frames: (H, W), how many frames S rests on.
+    """
+    specks = np.ones((_SPECKS, _SPECKS), np.uint8)
+    shaded = cv2.morphologyEx((shadow_frames > 0).view(np.uint8), cv2.MORPH_OPEN, specks)
+    away = cv2.distanceTransform(1 - shaded, cv2.DIST_L2, cv2.DIST_MASK_5)
+    far = away > _FROM_SHADE * max(shaded.shape)
+    return np.where(far, np.float32(_HARDLY), np.float32(np.inf))
+
+
 @dataclass(frozen=True)
 class Backdrop:
     """The scene without the figure.
@@ -44,16 +65,20 @@ class Backdrop:
         lit, shadow: (H, W, 3) float32, linear light, without NaN; or any pixels of it, (..., 3).
         noise: the take's.
         doubt: (H, W) float32, by how much S may be off besides, as a part of it.
+        missing: (H, W) float32, of `missing_shade`; None for as much as can be.
     """
 
     lit: Float32
     shadow: Float32
     noise: NoiseModel
     doubt: Float32
+    missing: Float32 | None = None
 
     def at(self, places: Places) -> "Backdrop":
         """Some of its pixels, by their rows and columns."""
-        return Backdrop(self.lit[places], self.shadow[places], self.noise, self.doubt[places])
+        missing = None if self.missing is None else self.missing[places]
+        own = self.lit[places], self.shadow[places], self.noise, self.doubt[places]
+        return Backdrop(*own, missing)
 
     def under(self, beta: Float32) -> Float32:
         """What is seen under β, (..., 3); below 0 what is darker than S."""
@@ -107,6 +132,9 @@ class Backdrop:
         square, from_lit2 = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         dots = np.zeros((2, *shape), np.float32)
         lengths = np.full((2, *shape), 1e-9, np.float32)
+        if self.missing is not None:
+            # As one more measurement, that nothing is missing.
+            lengths[1] += 1 / self.missing**2
         # By channel: sums over an axis of three are slow, and so is what lies apart in memory.
         for channel in range(3):
             value, lit, shadow = (

@@ -8,6 +8,7 @@ scene's shadows have in common.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -51,7 +52,14 @@ _BRIGHTER, _COUNTED, _DIFFERS = 0.1, 7.0, 1.35
 # part, is compared with; and of two whose texture is the ground's. Samples with ratios this much
 # around a frequent one have texture in common with it if they are shadow.
 _BRIGHT_RANKS, _NEXT, _TEXTURE_RANKS = (0.85, 0.7, 0.55), 0.08, (0.8, 0.95)
+# Of fewer samples most may be in shade.
+_ENOUGH = 12
 _AROUND, _LEAST_LIKELY = 0.3, 0.05
+# Windows down and across that may have ratios of their own, if they have more than the first part
+# of the ground's texture for certain, and differ by no more than the second, a logarithm. Between
+# them ratios go over in so many windows; the common one counts as so much of one.
+_WINDOWS, _CERTAIN, _FURTHEST = (4, 6), 0.15, 1.2
+_WINDOW_BLUR, _COMMON_WEIGHT, _LEAST_WINDOW = 0.7, 0.1, 20
 # Samples of one colour are within so many deviations of it; it is found in so many rounds.
 _CLUSTER, _ROUNDS, _LIGHTEST_RATIO = 2.5, 3, 0.9
 # From the first to the second β a sample is neither in light nor in shade, and counts so much.
@@ -108,7 +116,7 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     stack = np.nan_to_num(stack, copy=False, nan=0.0, posinf=1e4, neginf=0.0)
     weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
     ascending = np.argsort(stack.sum(axis=1), axis=0)
-    ratio = _common_ratio(stack, ascending, noise, shape[:2])[:, None]
+    ratio = _common_ratio(stack, ascending, noise, shape[:2])
     lit = _most_supported(stack, ascending, weighed, ratio)
     shadow = lit * ratio
     on_line = [_on_line(sample, lit, shadow) for sample in weighed]
@@ -165,31 +173,112 @@ def _ranked(stack: Float32, order: Index, pixels: Index | None = None) -> Float3
     return np.ascontiguousarray(stack[order[pixels], :, pixels].T)
 
 
+class _Compared(NamedTuple):
+    """Samples of a window of the grid beside light.
+
+    Attributes:
+        stack: (T, 3, N), the samples.
+        bright: (3, N), one of each point's that is lit.
+        difference: (T, N), the logarithm of their sums' ratio; 1 where it says nothing.
+        textures: lit ground twice, (N,), so that noise is not taken for its texture.
+        size: the window's, rows and columns.
+    """
+
+    stack: Float32
+    bright: Float32
+    difference: Float32
+    textures: list[Float32]
+    size: tuple[int, int]
+
+    def window(self, rows: slice, columns: slice) -> "_Compared":
+        where = np.arange(self.bright.shape[1]).reshape(self.size)[rows, columns]
+        points = where.ravel()
+        return _Compared(
+            self.stack.take(points, axis=2),
+            self.bright.take(points, axis=1),
+            self.difference.take(points, axis=1),
+            [texture.take(points) for texture in self.textures],
+            where.shape,
+        )
+
+
+class _Frequent(NamedTuple):
+    """A ratio that is frequent: (3,); how much speaks for it; how many samples have it, and how
+    much of the ground's texture they have for certain."""
+
+    ratio: Float32
+    weight: float
+    samples: float
+    follows: float
+
+
 def _common_ratio(
     stack: Float32, ascending: Index, noise: NoiseModel, size: tuple[int, int]
 ) -> Float32:
-    """S/L, (3,): the ratio below 1 between a pixel's samples and a brighter one that is much more
-    frequent than those a little above and below.
+    """S/L of each point, (3, N), as the scene's shadows have it in common around.
 
-    Shadow keeps the ground's texture, so its ratio is the same everywhere; a figure's is not, and
-    in a penumbra all ratios occur. So ratios of shadow scatter in no channel by more than noise,
-    where those of a figure scatter as widely as they are looked at. Plain clothes before even
-    ground have one ratio, too, but nothing of the ground's texture. Of a shadow that is all but
-    black noise leaves no ratio, but then more samples are black than have any one.
+    Of a shadow that is all but black noise leaves no ratio, but then more samples are black than
+    have any one. Where a lamp is near, its shadow is deeper than elsewhere: a window of the grid
+    has a ratio of its own if that certainly has the ground's texture.
     """
     bright = _usually_bright(stack, ascending)
-    others = (_ranked(stack, _rank(ascending, part)) for part in _TEXTURE_RANKS)
-    light = bright.sum(axis=0)
+    light, total = bright.sum(axis=0), stack.sum(axis=1)
     clear = light > _CLEAR * noise.sigma(bright.T).sum(axis=1)
-    total = stack.sum(axis=1)
-    textures = [other.sum(axis=0) for other in others]
     part = total / np.where(clear, light, 1)
-    difference = np.where(clear, np.log(np.maximum(part, 1e-4)), 1)
+    difference = np.where(clear, np.log(np.maximum(part, 1e-4)), 1).astype(np.float32)
+    others = (_ranked(stack, _rank(ascending, rank)) for rank in _TEXTURE_RANKS)
+    textures = [np.log(np.maximum(other.sum(axis=0), np.float32(1e-4))) for other in others]
+    compared = _Compared(stack, bright, difference, textures, size)
+    common = _most_frequent(compared, noise)
+    black = difference <= -_DEEPEST
+    if black.sum() > max(_BLACK * (0 if common is None else common.samples), _TELLING):
+        ratio = np.clip(np.median(_ratios(stack, bright, black), axis=0), 0, _LIGHTEST_RATIO)
+        return np.repeat(ratio[:, np.newaxis], light.size, axis=1)
+    if common is None:
+        return np.full(bright.shape, 0.25, np.float32)
+    return _with_windows(compared, common.ratio, noise)
+
+
+def _with_windows(compared: _Compared, common: Float32, noise: NoiseModel) -> Float32:
+    """The ratio of each point, (3, N), between those of windows that have one of their own."""
+    # Smaller windows have too few samples of anything.
+    rows, columns = (
+        np.array_split(np.arange(length), max(min(windows, length // _LEAST_WINDOW), 1))
+        for length, windows in zip(compared.size, _WINDOWS, strict=True)
+    )
+    own = np.zeros((len(rows), len(columns), 4), np.float32)
+    for i, down in enumerate(rows):
+        for j, across in enumerate(columns):
+            part = compared.window(slice(down[0], down[-1] + 1), slice(across[0], across[-1] + 1))
+            found = _most_frequent(part, noise)
+            if found is not None and found.samples >= _TELLING and found.follows > _CERTAIN:
+                shift = np.log(np.maximum(found.ratio, 1e-3) / np.maximum(common, 1e-3))
+                # What is lighter may be a penumbra, and is on the line as it is.
+                if shift.mean() > -_FURTHEST:
+                    own[i, j] = (*(shift if shift.mean() < 0 else np.zeros(3)), 1)
+    own = np.asarray(cv2.GaussianBlur(own, (0, 0), _WINDOW_BLUR), np.float32)
+    shift = own[..., :3] / (own[..., 3:] + np.float32(_COMMON_WEIGHT))
+    height, width = compared.size
+    field = cv2.resize(shift, (width, height), interpolation=cv2.INTER_LINEAR)
+    ratio = common * np.exp(field.reshape(-1, 3))
+    return np.ascontiguousarray(np.clip(ratio, 0, _LIGHTEST_RATIO).T, np.float32)
+
+
+def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
+    """The ratio below 1 between a point's samples and a brighter one that is much more frequent
+    than those a little above and below; None if none is.
+
+    Shadow keeps the ground's texture, so its ratio is the same all around; a figure's is not, and
+    in a penumbra all ratios occur. So ratios of shadow scatter in no channel by more than noise,
+    where those of a figure scatter as widely as they are looked at. Plain clothes before even
+    ground have one ratio, too, but nothing of the ground's texture.
+    """
+    stack, bright, difference, *_ = compared
     # Beyond what is looked for, too: it is next to some of that.
     counts, edges = np.histogram(difference, bins=210, range=(-_DEEPEST, 0.25))
     excess = _smoothed(counts, 11) - _smoothed(counts, 45)
     excess[(counts == 0) | (edges[1:] >= _LIGHTEST)] = -np.inf
-    found, best, usual = np.full(3, 0.25, np.float32), 0.0, 0.0
+    best: _Frequent | None = None
     for _ in range(_FREQUENT):
         peak = int(np.argmax(excess))
         if excess[peak] <= 0:
@@ -199,14 +288,12 @@ def _common_ratio(
         if alike.sum() >= _TELLING:
             ratio, pure, noisy = _told(stack, bright, alike, noise)
             lowered = min(float(np.hypot(1, noisy / _ALIKE)), _LOWERED)
-            follows = _follows(total, away < _AROUND, textures, size)
-            if (weight := excess[peak] * lowered * pure * follows**2) > best:
-                found, best, usual = ratio, weight, alike.sum() * pure
+            certain, possible = _follows(compared, away < _AROUND)
+            weight = excess[peak] * lowered * pure * possible**2
+            if weight > (0 if best is None else best.weight):
+                best = _Frequent(ratio, weight, float(alike.sum()) * pure, certain)
         excess[max(peak - _BINS, 0) : peak + _BINS + 1] = -np.inf
-    black = difference <= -_DEEPEST
-    if black.sum() > max(_BLACK * usual, _TELLING):
-        found = np.clip(np.median(_ratios(stack, bright, black), axis=0), 0, _LIGHTEST_RATIO)
-    return found
+    return best
 
 
 def _usually_bright(stack: Float32, ascending: Index) -> Float32:
@@ -215,7 +302,7 @@ def _usually_bright(stack: Float32, ascending: Index) -> Float32:
     total = stack.sum(axis=1)
     found = np.zeros(stack.shape[1:], np.float32)
     most = np.full(stack.shape[2], -1)
-    for part in _BRIGHT_RANKS:
+    for part in _BRIGHT_RANKS[: None if len(stack) >= _ENOUGH else 1]:
         candidate = _ranked(stack, _rank(ascending, part))
         light = candidate.sum(axis=0)
         near = np.count_nonzero(np.abs(total - light) < _NEXT * light, axis=0)
@@ -247,8 +334,8 @@ def _told(
     inside = (np.abs(colour - _densest(colour, float(np.median(within)))) < within).all(axis=1)
     for _ in range(_ROUNDS if inside.any() else 0):
         inside = (np.abs(colour - np.median(colour[inside], axis=0)) < within).all(axis=1)
-    pure = float(inside.mean())
-    ratio = np.median(ratios[inside] if pure else ratios, axis=0)
+    pure = max(float(inside.mean()), _LEAST_LIKELY)
+    ratio = np.median(ratios[inside] if inside.any() else ratios, axis=0)
     return np.clip(ratio, 0, _LIGHTEST_RATIO), pure, float(np.median(noisy))
 
 
@@ -262,35 +349,29 @@ def _densest(colour: Float32, width: float) -> Float32:
     return np.array([middle[red], -middle[red] - middle[blue], middle[blue]], np.float32)
 
 
-def _follows(total: Float32, chosen: Bool, textures: list[Float32], size: tuple[int, int]) -> float:
-    """How much the chosen samples may have of the texture of lit ground: 1 is all, and also the
-    answer where that can't be told; `_LEAST_LIKELY` is nothing.
+def _follows(compared: _Compared, chosen: Bool) -> tuple[float, float]:
+    """How much the chosen samples, (T, N), have of the texture of lit ground, 1 all of it: at
+    least, and at most; 0 and 1 where that can't be told.
 
     It is the slope of logarithmic steps from point to point, and twice its standard error.
-
-    Args:
-        total: (T, N), of the grid's points.
-        chosen: (T, N).
-        textures: lit ground twice, (N,), so that noise is not taken for its texture.
     """
-    logarithms = [
-        np.log(np.maximum(values, np.float32(1e-4))).reshape(-1, *size)
-        for values in (total, *textures)
-    ]
+    total = np.log(np.maximum(compared.stack.sum(axis=1), np.float32(1e-4)))
+    logarithms = [values.reshape(-1, *compared.size) for values in (total, *compared.textures)]
     pairs = []
     for axis in (1, 2):
-        where = np.moveaxis(chosen.reshape(-1, *size), axis, -1)
+        where = np.moveaxis(chosen.reshape(-1, *compared.size), axis, -1)
         time, row, column = np.nonzero(where[..., 1:] & where[..., :-1])
         changes = (np.diff(np.moveaxis(values, axis, -1)) for values in logarithms)
         pairs.append([change[time * (len(change) > 1), row, column] for change in changes])
     steps = np.hstack(pairs)
     # Where the ground itself differs by more only what follows it is among the chosen.
     own, one, other = steps[:, (np.abs(steps[1:]) < _AROUND / 2).all(axis=0)]
-    texture = float(one @ other)
-    error = float(np.linalg.norm(own) * np.linalg.norm(other)) / max(len(own), 1) ** 0.5
-    if texture <= 2 * error:
-        return 1.0
-    return float(np.clip((own @ other + 2 * error) / texture, _LEAST_LIKELY, 1))
+    texture, common = float(one @ other), float(own @ other)
+    error = 2 * float(np.linalg.norm(own) * np.linalg.norm(other)) / max(len(own), 1) ** 0.5
+    if texture <= error:
+        return 0.0, 1.0
+    least, most = (common - error) / texture, (common + error) / texture
+    return max(least, 0.0), min(max(most, _LEAST_LIKELY), 1.0)
 
 
 def _smoothed(counts: NDArray[np.integer], bins: int) -> NDArray[np.float64]:
@@ -318,7 +399,7 @@ def _most_supported(
             pixels = pixels[undecided]
             remaining = [sample.take(np.flatnonzero(undecided)) for sample in remaining]
         candidate = _ranked(stack, order, pixels)
-        score = _support(remaining, candidate, candidate * ratio)
+        score = _support(remaining, candidate, candidate * ratio[:, pixels])
         better = score > best[pixels]
         best[pixels[better]] = score[better]
         lit[:, pixels[better]] = candidate[:, better]

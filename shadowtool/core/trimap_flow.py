@@ -14,7 +14,7 @@ UInt8 = NDArray[np.uint8]
 
 # Flow is found on pictures of about this width.
 _WIDTH = 480
-# This percentile of a picture is white.
+# This percentile of a picture is white, if it is brighter than 1.
 _WHITE = 99
 # What each step adds to the error in pixels of them, and the error at which a pixel is lost.
 _DRIFT, _LOST = 0.25, 6.0
@@ -47,7 +47,7 @@ def flow_picture(image: NDArray[np.floating]) -> UInt8:
     size = (max(round(width / step), 16), max(round(height / step), 16))
     grey = np.nan_to_num(image.astype(np.float32)).mean(axis=-1)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    small /= max(float(np.percentile(small, _WHITE)), 1e-6)
+    small /= max(float(np.percentile(small, _WHITE)), 1)
     return np.asarray(np.rint(np.clip(small, 0, 1) ** np.float32(1 / 2.2) * 255), np.uint8)
 
 

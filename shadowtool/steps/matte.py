@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Beta, Fill, Gain, Only, Steady
 from shadowtool.core import beta as shadow_beta
-from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.backdrop import Backdrop, missing_shade
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.boxes import Box, around
 from shadowtool.core.camera_motion import Place, Vantage
@@ -228,10 +228,11 @@ class _Scene:
             )
         gauge = shadow_beta.Gauge.of(Plates(lit, shadow), contrasts, never_shaded)
         step = grid_step(lit.shape[1], lit.shape[0])
-        doubt = np.broadcast_to(np.float32(0), unknown.shape)
+        doubt, missing = np.broadcast_to(np.float32(0), unknown.shape), None
         if plates.shadow_frames is not None:
             doubt = np.where(plates.shadow_frames == 0, np.float32(_GUESSED), np.float32(0))
-        backdrop = Backdrop(lit, shadow, noise, doubt)
+            missing = missing_shade(plates.shadow_frames)
+        backdrop = Backdrop(lit, shadow, noise, doubt, missing)
         reached = shadow_beta.without_holes(never_shaded)
         return cls(backdrop, unknown, reached, gauge, confidence, step, on_grid(lit, step))
 

@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.backdrop import Backdrop, missing_shade
 from tests.figures import BACKDROP, SCENE
 
 SMALL = BACKDROP.at((slice(0, 4), slice(0, 5)))
@@ -41,6 +43,23 @@ def test_the_background_lies_on_its_own_line(part: float) -> None:
     found = SMALL.nearest(SMALL.under(beta))
     assert found.distance2 == pytest.approx(0, abs=1e-2)
     assert found.beta == pytest.approx(beta, abs=1e-3)
+
+
+def test_away_from_all_shade_hardly_anything_is_darker_than_it() -> None:
+    frames = np.zeros((90, 160), np.uint32)
+    frames[60:80, 20:60] = 4
+    # Noise that looks like shade is none.
+    frames[::7, ::7] = 1
+    missing = missing_shade(frames)
+    assert np.isinf(missing[58:82, 18:62]).all()
+    assert np.isfinite(missing[:50]).all() and np.isfinite(missing[:, 70:]).all()
+    deep = (SCENE.shadow * np.float32(0.6)).astype(np.float32)
+    anywhere, nowhere = (
+        replace(BACKDROP, missing=np.full(SCENE.lit.shape[:2], part, np.float32)).nearest(deep)
+        for part in (np.inf, 0.1)
+    )
+    assert np.array_equal(anywhere.distance2, BACKDROP.nearest(deep).distance2)
+    assert np.median(nowhere.distance2) > np.median(anywhere.distance2) + 10
 
 
 def test_zero_is_shadow_and_one_is_light() -> None:

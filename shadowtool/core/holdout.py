@@ -49,19 +49,21 @@ _SHADED, _MOST, _AT_ONCE = 0.5, 0.5, 0.2
 _LARGE, _SOMEBODY = 0.09, 0.6
 _BRIGHTER, _COUNTED, _DIFFERS = 0.1, 7.0, 1.35
 # Ranks of samples that may be lit, of which the one that most samples are as near to as that, as a
-# part, is compared with; and of two whose texture is the ground's. Samples with ratios this much
-# around a frequent one have texture in common with it if they are shadow.
-_BRIGHT_RANKS, _NEXT, _TEXTURE_RANKS = (0.85, 0.7, 0.55), 0.08, (0.8, 0.95)
-# Of fewer samples most may be in shade.
-_ENOUGH = 12
-_AROUND, _LEAST_LIKELY = 0.3, 0.05
-# Windows down and across that may have ratios of their own, if they have more than the first part
-# of the ground's texture for certain, and differ by no more than the second, a logarithm. Between
-# them ratios go over in so many windows; the common one counts as so much of one.
-_WINDOWS, _CERTAIN, _FURTHEST = (4, 6), 0.15, 1.2
-_WINDOW_BLUR, _COMMON_WEIGHT, _LEAST_WINDOW = 0.7, 0.1, 20
-# Samples of one colour are within so many deviations of it; it is found in so many rounds.
+# part, is compared with, if there are so many samples: of fewer most may be in shade.
+_BRIGHT_RANKS, _NEXT, _ENOUGH = (0.85, 0.7, 0.55), 0.08, 12
+# Ranks of two samples whose texture is the ground's. Samples with ratios this much around a
+# frequent one have texture in common with it if they are shadow; what has none, or no one colour,
+# counts as the last part.
+_TEXTURE_RANKS, _AROUND, _LEAST_LIKELY = (0.8, 0.95), 0.3, 0.05
+# Samples of one colour are within so many deviations of it; it is found in so many rounds. No ratio
+# of shadow is above the last.
 _CLUSTER, _ROUNDS, _LIGHTEST_RATIO = 2.5, 3, 0.9
+# So many windows down and across, of so many points down and across at least, may have ratios of
+# their own, if they have more than the first part of the ground's texture for certain, and differ
+# by no more than the second, a logarithm.
+_WINDOWS, _LEAST_WINDOW, _CERTAIN, _FURTHEST = (4, 6), 20, 0.15, 1.2
+# Between them ratios go over in so many windows; the common one counts as so much of one.
+_WINDOW_BLUR, _COMMON_WEIGHT = 0.7, 0.1
 # From the first to the second β a sample is neither in light nor in shade, and counts so much.
 _SHADE_ENDS, _LIGHT_BEGINS, _BETWEEN = 0.15, 0.85, 0.75
 # Candidates for L are every so many of a pixel's samples, dark to bright.
@@ -180,26 +182,23 @@ class _Compared(NamedTuple):
         stack: (T, 3, N), the samples.
         bright: (3, N), one of each point's that is lit.
         difference: (T, N), the logarithm of their sums' ratio; 1 where it says nothing.
-        textures: lit ground twice, (N,), so that noise is not taken for its texture.
+        logarithm: (T, N), that of the samples' sums.
+        textures: (2, N), that of lit ground twice, so that noise is not taken for its texture.
         size: the window's, rows and columns.
     """
 
     stack: Float32
     bright: Float32
     difference: Float32
-    textures: list[Float32]
+    logarithm: Float32
+    textures: Float32
     size: tuple[int, int]
 
-    def window(self, rows: slice, columns: slice) -> "_Compared":
-        where = np.arange(self.bright.shape[1]).reshape(self.size)[rows, columns]
-        points = where.ravel()
-        return _Compared(
-            self.stack.take(points, axis=2),
-            self.bright.take(points, axis=1),
-            self.difference.take(points, axis=1),
-            [texture.take(points) for texture in self.textures],
-            where.shape,
-        )
+    def window(self, rows: Index, columns: Index) -> "_Compared":
+        """The same of some of the rows and columns."""
+        points = (rows[:, np.newaxis] * self.size[1] + columns).ravel()
+        parts = [values.take(points, axis=-1) for values in self[:-1]]
+        return _Compared._make([*parts, (len(rows), len(columns))])
 
 
 class _Frequent(NamedTuple):
@@ -221,18 +220,20 @@ def _common_ratio(
     have any one. Where a lamp is near, its shadow is deeper than elsewhere: a window of the grid
     has a ratio of its own if that certainly has the ground's texture.
     """
-    bright = _usually_bright(stack, ascending)
-    light, total = bright.sum(axis=0), stack.sum(axis=1)
+    total = stack.sum(axis=1)
+    bright = _usually_bright(stack, total, ascending)
+    light = bright.sum(axis=0)
     clear = light > _CLEAR * noise.sigma(bright.T).sum(axis=1)
     part = total / np.where(clear, light, 1)
     difference = np.where(clear, np.log(np.maximum(part, 1e-4)), 1).astype(np.float32)
-    others = (_ranked(stack, _rank(ascending, rank)) for rank in _TEXTURE_RANKS)
-    textures = [np.log(np.maximum(other.sum(axis=0), np.float32(1e-4))) for other in others]
-    compared = _Compared(stack, bright, difference, textures, size)
+    others = [_ranked(stack, _rank(ascending, rank)).sum(axis=0) for rank in _TEXTURE_RANKS]
+    logarithm, textures = (np.log(np.maximum(sums, np.float32(1e-4))) for sums in (total, others))
+    compared = _Compared(stack, bright, difference, logarithm, textures, size)
     common = _most_frequent(compared, noise)
     black = difference <= -_DEEPEST
     if black.sum() > max(_BLACK * (0 if common is None else common.samples), _TELLING):
-        ratio = np.clip(np.median(_ratios(stack, bright, black), axis=0), 0, _LIGHTEST_RATIO)
+        _, ratios = _ratios(stack, bright, black)
+        ratio = np.clip(np.median(ratios, axis=0), 0, _LIGHTEST_RATIO)
         return np.repeat(ratio[:, np.newaxis], light.size, axis=1)
     if common is None:
         return np.full(bright.shape, 0.25, np.float32)
@@ -249,13 +250,15 @@ def _with_windows(compared: _Compared, common: Float32, noise: NoiseModel) -> Fl
     own = np.zeros((len(rows), len(columns), 4), np.float32)
     for i, down in enumerate(rows):
         for j, across in enumerate(columns):
-            part = compared.window(slice(down[0], down[-1] + 1), slice(across[0], across[-1] + 1))
-            found = _most_frequent(part, noise)
-            if found is not None and found.samples >= _TELLING and found.follows > _CERTAIN:
-                shift = np.log(np.maximum(found.ratio, 1e-3) / np.maximum(common, 1e-3))
-                # What is lighter may be a penumbra, and is on the line as it is.
-                if shift.mean() > -_FURTHEST:
-                    own[i, j] = (*(shift if shift.mean() < 0 else np.zeros(3)), 1)
+            found = _most_frequent(compared.window(down, across), noise)
+            if found is None or found.samples < _TELLING or found.follows <= _CERTAIN:
+                continue
+            shift = np.log(np.maximum(found.ratio, 1e-3) / np.maximum(common, 1e-3))
+            if shift.mean() <= -_FURTHEST:
+                continue
+            # What is lighter may be a penumbra, and is on the line as it is.
+            own[i, j, :3] = shift if shift.mean() < 0 else 0
+            own[i, j, 3] = 1
     own = np.asarray(cv2.GaussianBlur(own, (0, 0), _WINDOW_BLUR), np.float32)
     shift = own[..., :3] / (own[..., 3:] + np.float32(_COMMON_WEIGHT))
     height, width = compared.size
@@ -273,7 +276,7 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
     where those of a figure scatter as widely as they are looked at. Plain clothes before even
     ground have one ratio, too, but nothing of the ground's texture.
     """
-    stack, bright, difference, *_ = compared
+    difference = compared.difference
     # Beyond what is looked for, too: it is next to some of that.
     counts, edges = np.histogram(difference, bins=210, range=(-_DEEPEST, 0.25))
     excess = _smoothed(counts, 11) - _smoothed(counts, 45)
@@ -286,7 +289,7 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
         away = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2)
         alike = away < _ALIKE
         if alike.sum() >= _TELLING:
-            ratio, pure, noisy = _told(stack, bright, alike, noise)
+            ratio, pure, noisy = _told(compared, alike, noise)
             lowered = min(float(np.hypot(1, noisy / _ALIKE)), _LOWERED)
             certain, possible = _follows(compared, away < _AROUND)
             weight = excess[peak] * lowered * pure * possible**2
@@ -296,10 +299,9 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
     return best
 
 
-def _usually_bright(stack: Float32, ascending: Index) -> Float32:
+def _usually_bright(stack: Float32, total: Float32, ascending: Index) -> Float32:
     """Of a pixel's samples that may be lit the one that most others are next to, (3, N): somebody
     bright is not there for long."""
-    total = stack.sum(axis=1)
     found = np.zeros(stack.shape[1:], np.float32)
     most = np.full(stack.shape[2], -1)
     for part in _BRIGHT_RANKS[: None if len(stack) >= _ENOUGH else 1]:
@@ -311,22 +313,18 @@ def _usually_bright(stack: Float32, ascending: Index) -> Float32:
     return found
 
 
-def _ratios(stack: Float32, bright: Float32, chosen: Bool) -> Float32:
-    """Of the chosen samples, (T, N), to what is bright; (M, 3)."""
+def _ratios(stack: Float32, bright: Float32, chosen: Bool) -> tuple[Float32, Float32]:
+    """The chosen samples, (T, N), and their ratios to what is bright; (M, 3) each."""
     time, pixel = np.nonzero(chosen)
-    light = bright[:, pixel].T
+    own, light = stack[time, :, pixel], bright[:, pixel].T
     # A channel may be black where the colour is not.
-    return np.asarray(stack[time, :, pixel] / np.where(light > 0, light, 1), np.float32)
+    return own, np.asarray(own / np.where(light > 0, light, 1), np.float32)
 
 
-def _told(
-    stack: Float32, bright: Float32, chosen: Bool, noise: NoiseModel
-) -> tuple[Float32, float, float]:
+def _told(compared: _Compared, chosen: Bool, noise: NoiseModel) -> tuple[Float32, float, float]:
     """The ratio of the chosen samples, (T, N), in the colour that most of them have, (3,); what
     part of them has it; and what part of it is noise."""
-    time, pixel = np.nonzero(chosen)
-    own = stack[time, :, pixel]
-    ratios = _ratios(stack, bright, chosen)
+    own, ratios = _ratios(compared.stack, compared.bright, chosen)
     logarithm = np.log(np.maximum(ratios, np.float32(1e-4)))
     noisy = noise.sigma(own) / np.maximum(own, np.float32(1e-4))
     within = _CLUSTER * np.hypot(noisy, _SCATTER)
@@ -355,8 +353,9 @@ def _follows(compared: _Compared, chosen: Bool) -> tuple[float, float]:
 
     It is the slope of logarithmic steps from point to point, and twice its standard error.
     """
-    total = np.log(np.maximum(compared.stack.sum(axis=1), np.float32(1e-4)))
-    logarithms = [values.reshape(-1, *compared.size) for values in (total, *compared.textures)]
+    logarithms = [
+        values.reshape(-1, *compared.size) for values in (compared.logarithm, *compared.textures)
+    ]
     pairs = []
     for axis in (1, 2):
         where = np.moveaxis(chosen.reshape(-1, *compared.size), axis, -1)

@@ -9,6 +9,7 @@ They are told apart by their shape: at a rim S/L climbs from full shadow to none
 a penumbra, on a surface it is level.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -70,6 +71,16 @@ def _level(gray: Float32, usual: Float32, frames: NDArray[np.uint32], least: int
         usual: of `_usual`.
     """
     return (frames >= least) & np.isfinite(gray) & (_slope(usual) < _SLOPE)
+
+
+def _surfaces(gray: Float32, usual: Float32, frames: NDArray[np.uint32]) -> Iterator[Bool]:
+    """Where a shadow may have fallen in full, (H, W), what tells it best first."""
+    # In a take of few frames no shadow stays for several.
+    for least in (_FIRM, 1):
+        yield _opened(_level(gray, usual, frames, least))
+    # A thin one is level nowhere.
+    often = (frames >= _FIRM) & np.isfinite(gray)
+    yield _opened(often & ~_opened(often, 2 * _cell(gray.shape) + 1), 3)
 
 
 def _usual(gray: Float32) -> Float32:
@@ -153,14 +164,7 @@ def complete_shadow(
     usual = _usual(gray)
     with np.errstate(invalid="ignore"):
         alone = np.abs(gray - usual) > _COMMON
-    # In a take of few frames no shadow stays for several, and a thin one is level nowhere.
-    often = (frames >= _FIRM) & np.isfinite(gray)
-    thin = often & ~_opened(often, 2 * _cell(dark.shape) + 1)
-    for surface in (
-        _opened(_level(gray, usual, frames)),
-        _opened(_level(gray, usual, frames, 1)),
-        _opened(thin, 3),
-    ):
+    for surface in _surfaces(gray, usual, frames):
         if (found := _ratio_field(lit, shadow, gray, surface, plane)) is not None:
             break
     result = np.asarray(cv2.copyTo(shadow, dark.view(np.uint8), lit.copy()), np.float32)
@@ -233,7 +237,8 @@ def _missed_by_the_card(lit: Float32, looked_at: Bool, dark: Bool, ratio: Float3
 
 
 def _opened(mask: Bool, width: int = 5) -> Bool:
-    """A mask without what is narrower than a few pixels: noise that looks like a shadow."""
+    """A mask without what is narrower than so many pixels: by default noise that looks like a
+    shadow."""
     small = np.ones((width, width), np.uint8)
     return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
 

@@ -14,8 +14,8 @@ UInt8 = NDArray[np.uint8]
 
 # Flow is found on pictures of about this width.
 _WIDTH = 480
-# This percentile of a picture is white, if it is brighter than 1.
-_WHITE = 99
+# This percentile of every so many rows and columns is white, if it is brighter than 1.
+_WHITE, _EVERY = 99, 4
 # What each step adds to the error in pixels of them, and the error at which a pixel is lost.
 _DRIFT, _LOST = 0.25, 6.0
 
@@ -41,14 +41,19 @@ class Carried(NamedTuple):
 
 
 def flow_picture(image: NDArray[np.floating]) -> UInt8:
-    """The small grey picture, (h, w) uint8, of a frame (H, W, 3) in linear light of any scale."""
+    """The small grey picture, (h, w) uint8, of a frame (H, W, 3) in linear light; NaN is black, and
+    what is infinite white."""
     height, width = image.shape[:2]
     step = max(1.0, width / _WIDTH)
     size = (max(round(width / step), 16), max(round(height / step), 16))
-    grey = np.nan_to_num(image.astype(np.float32)).mean(axis=-1)
+    with np.errstate(over="ignore"):
+        grey = np.nan_to_num(image.astype(np.float32), posinf=np.inf).mean(axis=-1)
+    some = grey[::_EVERY, ::_EVERY]
+    some = some[np.isfinite(some)]
+    white = max(float(np.percentile(some, _WHITE)), 1) if some.size else 1.0
+    grey = np.clip(grey / np.float32(white), 0, 1)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    small /= max(float(np.percentile(small, _WHITE)), 1)
-    return np.asarray(np.rint(np.clip(small, 0, 1) ** np.float32(1 / 2.2) * 255), np.uint8)
+    return np.asarray(np.rint(small ** np.float32(1 / 2.2) * 255), np.uint8)
 
 
 def links(here: UInt8, there: UInt8) -> tuple[Link, Link]:

@@ -140,8 +140,7 @@ def capture(
     if opened.wanted is not None:
         refuse_existing(map(taking.place, opened.wanted), run)
     else:
-        there = sorted(output.glob(f"*{suffix}"))
-        refuse_existing(there, run)
+        refuse_existing(sorted(output.glob(f"*{suffix}")), run)
     with new_folders([output], shared=run.frames is not None):
         frames, skipped, report = taking.take()
         if not frames:

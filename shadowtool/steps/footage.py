@@ -28,7 +28,6 @@ logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 
-
 # Steps whose mattes lie where the plates see the scene from.
 _IN_PLACE = ("shadowtool plate ", "shadowtool matte ")
 

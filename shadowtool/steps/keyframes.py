@@ -91,6 +91,8 @@ class Keyframes:
             width, height = self.footage.header.size
             return np.full((height, width), UNKNOWN, np.uint8)
         whole = merge(sides)
+        if place == (0.0, 0.0):
+            return whole
         header = read_header(self.drawn.path(keys[0]))
         moved = moved_with(whole / np.float32(FIGURE), header, place)
         return _three_levels(moved, 1 / 4, 3 / 4)
@@ -124,6 +126,7 @@ def trimap_of(path: Path) -> UInt8:
 
 
 def _three_levels(plane: NDArray[np.floating], black: float, white: float) -> UInt8:
+    """A trimap of what is below a value, above another, and between."""
     trimap = np.full(plane.shape, UNKNOWN, np.uint8)
     trimap[plane < black] = BACKGROUND
     trimap[plane > white] = FIGURE

@@ -61,8 +61,8 @@ class Recipe:
         parameters: values that JSON can hold; no paths, no number of jobs.
         inputs: what was read, as a person would name it, by option (numbered, ``--scan 2``, if it
             is given more than once), or by a word of its own for an argument.
-        transfers: the transfer functions that inputs were taken to have, by option, where no
-            parameter says it.
+        transfers: the transfer functions that inputs were taken to have, by the same names, where
+            one parameter does not say it of all.
     """
 
     step: str

@@ -230,6 +230,31 @@ def test_bright_clothes_in_the_grounds_colour_make_no_shade_of_the_ground() -> N
     assert np.mean(held) > 0.95
 
 
+def test_near_a_lamp_shadow_is_deeper_and_still_no_figure() -> None:
+    """A ratio that goes from 0.16 on the left to 0.35: no one ratio is the scene's."""
+    rng = np.random.default_rng(2)
+    texture = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 1)
+    lit = 0.4 * np.exp(0.08 / texture.std() * texture)[..., None] * np.array([1.05, 1.0, 0.9])
+    ratio = (0.16 * (0.35 / 0.16) ** (COLUMNS / WIDTH))[..., None]
+    frames, betas, alphas = [], [], []
+    for number in range(FRAMES):
+        x = steadily(number)
+        betas.append(shadow_beta(x))
+        alphas.append(figure_alpha(x))
+        image = lit * (ratio + betas[-1][..., None] * (1 - ratio))
+        image += alphas[-1][..., None] * (figure_colour(x, MANY) - image)
+        frames.append(SCENE.noisy(image.astype(np.float32), number))
+    chosen = np.linspace(0, FRAMES - 1, SAMPLES).round().astype(int)
+    background = find_background([frames[i] for i in chosen], NOISE)
+    shade, figure = [], []
+    for frame, beta, alpha in zip(frames, betas, alphas, strict=True):
+        mask = figure_mask(frame, background)
+        shade.append(mask[(beta < 0.05) & (ROWS > 110)].mean())
+        figure.append(mask[alpha > 0.5].mean())
+    assert np.mean(shade) < 0.05
+    assert np.mean(figure) > 0.95
+
+
 def test_a_surface_that_shade_makes_darker_than_others_is_background_too() -> None:
     wall = (COLUMNS > 100) & (COLUMNS < 160) & (ROWS > 95)
     grain = 0.7 * np.exp(0.4 * np.random.default_rng(0).normal(size=wall.shape))[..., None]

@@ -109,3 +109,15 @@ def test_the_small_picture_of_what_is_brighter_than_1_is_not_all_white() -> None
     two, many = (flow_picture(frame(0) * np.float32(scale)) for scale in (4, 64))
     assert np.abs(two.astype(int) - many).max() <= 1
     assert 100 < np.median(two) < 250
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 3e38])
+@pytest.mark.parametrize("size", [(8, 6), (270, 480)])
+def test_what_is_not_finite_stays_where_it_is(bad: float, size: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).uniform(0.1, 0.8, (*size, 3)).astype(np.float32)
+    spoiled = image.copy()
+    spoiled[: size[0] // 4, : size[1] // 4] = bad
+    whole, part = flow_picture(image), flow_picture(spoiled)
+    height, width = whole.shape
+    assert np.array_equal(whole[height // 2 :], part[height // 2 :])
+    assert np.array_equal(whole[:, width // 2 :], part[:, width // 2 :])

@@ -284,7 +284,8 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
     best: _Frequent | None = None
     for _ in range(_FREQUENT):
         peak = int(np.argmax(excess))
-        if excess[peak] <= 0:
+        # Nothing that is no more frequent than this can be worth more.
+        if excess[peak] * _LOWERED <= (0 if best is None else best.weight):
             break
         away = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2)
         alike = away < _ALIKE
@@ -331,7 +332,10 @@ def _told(compared: _Compared, chosen: Bool, noise: NoiseModel) -> tuple[Float32
     colour = logarithm - logarithm.mean(axis=1, keepdims=True)
     inside = (np.abs(colour - _densest(colour, float(np.median(within)))) < within).all(axis=1)
     for _ in range(_ROUNDS if inside.any() else 0):
+        before = inside
         inside = (np.abs(colour - np.median(colour[inside], axis=0)) < within).all(axis=1)
+        if np.array_equal(inside, before):
+            break
     pure = max(float(inside.mean()), _LEAST_LIKELY)
     ratio = np.median(ratios[inside] if inside.any() else ratios, axis=0)
     return np.clip(ratio, 0, _LIGHTEST_RATIO), pure, float(np.median(noisy))

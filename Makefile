@@ -1,5 +1,5 @@
 # `make` sets up and runs the sample shot; `make test` sets up and checks everything.
-# Both need python3 (3.11 or later) and nothing else.
+# Both need python3 (3.11 or later) and nothing else; a C compiler makes reading EXR faster.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -37,7 +37,7 @@ format: .venv/installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-.venv/installed-bench: pyproject.toml | .venv/bin/python
+.venv/installed-bench: pyproject.toml shadowtool/io/_unzip.c | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev,sample,bench]"
 	touch $@ .venv/installed-dev .venv/installed
 
@@ -53,12 +53,12 @@ clean:
 	$(PYTHON) -m venv .venv
 
 # Compiled once, for accounts that may not write here.
-.venv/installed: pyproject.toml | .venv/bin/python
+.venv/installed: pyproject.toml shadowtool/io/_unzip.c | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	$(BIN)/python -m compileall -q shadowtool
 	touch $@
 
-.venv/installed-dev: pyproject.toml | .venv/bin/python
+.venv/installed-dev: pyproject.toml shadowtool/io/_unzip.c | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	$(BIN)/python -m compileall -q shadowtool
 	touch $@ .venv/installed

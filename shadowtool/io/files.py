@@ -73,19 +73,34 @@ def fingerprinted(paths: Sequence[Path]) -> Iterator[list[str]]:
         _known.files = before
 
 
-@contextlib.contextmanager
-def unchanging(path: Path) -> Iterator[tuple[str | BinaryIO, str]]:
-    """A file for a library to decode, and its `fingerprint`.
+class File(NamedTuple):
+    """A file that is being read.
 
-    The library gets the file's name: by itself it reads fastest. It gets the content where the
-    name is in no encoding.
+    Attributes:
+        data: its content.
+        source: what a library is to decode: the file's name, since by itself it reads fastest;
+            the content where the name is in no encoding.
+        fingerprint: see `fingerprint`.
+    """
+
+    data: bytes
+    source: str | BinaryIO
+    fingerprint: str
+
+
+@contextlib.contextmanager
+def unchanging(path: Path) -> Iterator[File]:
+    """A file, for a library to decode or for the caller.
 
     Raises:
         InputError, RetryError: as `read_bytes`; RetryError also if the file changed meanwhile.
     """
-    version, mark = _known.files.get(path) or (_version(path), fingerprint_file(path))
+    known = _known.files.get(path)
+    version = known[0] if known else _version(path)
+    data = read_bytes(path)
     name = os.fspath(path)
-    yield name if _is_text(name) else io.BytesIO(read_bytes(path)), mark
+    source = name if _is_text(name) else io.BytesIO(data)
+    yield File(data, source, known[1] if known else fingerprint(data))
     if _version(path) != version:
         raise _changed(path)
 

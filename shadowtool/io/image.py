@@ -5,7 +5,6 @@ function.
 """
 
 import contextlib
-import ctypes
 import io
 import logging
 import struct
@@ -27,13 +26,16 @@ from shadowtool.core.half_floats import to_float
 from shadowtool.core.half_floats import to_half as to_half
 from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import DamagedFileError, InputError, RetryError, ShadowtoolError
+from shadowtool.io import scanlines
 from shadowtool.io.files import (
     Content,
+    File,
     read_content,
     require_readable,
     unchanging,
     write_bytes,
 )
+from shadowtool.io.openexr_core import set_zip_level
 
 logger = logging.getLogger(__name__)
 
@@ -312,8 +314,8 @@ def read_image(path: Path, apart: bool = False) -> Image:
     """
     if path.suffix.lower() == PNG:
         return _decode_png(path, read_content(path))
-    with unchanging(path) as (source, fingerprint):
-        return _decode_exr(path, source, fingerprint, apart)
+    with unchanging(path) as file:
+        return _decode_exr(path, file, apart)
 
 
 def write_exr(
@@ -410,10 +412,7 @@ class _ZipLevel:
                 self._changed.notify_all()
 
     def _set(self, level: int) -> None:
-        # The Python binding leaves this function of OpenEXR's out. A build that hides it writes
-        # the same pixels, in more time.
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(OpenEXR.__file__).exr_set_default_zip_compression_level(level)
+        set_zip_level(level)
         self._now = level
 
 
@@ -511,11 +510,31 @@ def _window(path: Path, raw: Mapping[str, Any], name: str) -> tuple[Corner, Corn
     return (first[0], first[1]), (last[0], last[1])
 
 
-def _decode_exr(path: Path, source: str | BinaryIO, fingerprint: str, apart: bool) -> Image:
+def _decode_exr(path: Path, file: File, apart: bool) -> Image:
     # The header first: a picture that is refused must not be decoded, and a damaged part of a
     # multi-part file vanishes without a word when the pixels are read.
-    listed = _open_exr(path, source, header_only=True)
+    listed = _open_exr(path, file.source, header_only=True)
     header = _exr_header(path, listed)
+    raw = listed.header(0)
+    channels = scanlines.decode(file.data, apart) or _channels(path, file.source, listed, apart)
+    first, last = _window(path, raw, "dataWindow")
+    layers = {}
+    for name, values in channels.items():
+        if values is None or values.shape[:2] != (last[1] - first[1] + 1, last[0] - first[0] + 1):
+            raise InputError(f"{path}: channel {name} is subsampled; write it at full size")
+        layers[name] = _placed(values, first, header)
+    if not layers:
+        raise InputError(f"{path}: has no channels")
+    if not apart and set("RGB") <= layers.keys():
+        names = [name for name in "RGBA" if name in layers]
+        layers["".join(names)] = _joined([layers.pop(name) for name in names])
+    return Image(path, header, layers, file.fingerprint)
+
+
+def _channels(
+    path: Path, source: str | BinaryIO, listed: Any, apart: bool
+) -> Mapping[str, NDArray[Any] | None]:
+    """A file's channels as OpenEXR decodes them, some of them joined unless ``apart``."""
     apart = apart and set("RGB") <= {channel.name for channel in listed.header(0)["channels"]}
     try:
         file = _open_exr(path, source, separate=apart)
@@ -526,20 +545,7 @@ def _decode_exr(path: Path, source: str | BinaryIO, fingerprint: str, apart: boo
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
     if len(file.parts) > 1:
         logger.warning("%s: of %d parts the first is taken", path, len(file.parts))
-    raw = file.header(0)
-    first, last = _window(path, raw, "dataWindow")
-    layers = {}
-    for name, channel in file.channels(0).items():
-        values = channel.pixels
-        if values is None or values.shape[:2] != (last[1] - first[1] + 1, last[0] - first[0] + 1):
-            raise InputError(f"{path}: channel {name} is subsampled; write it at full size")
-        layers[name] = _placed(values, first, header)
-    if not layers:
-        raise InputError(f"{path}: has no channels")
-    if not apart and set("RGB") <= layers.keys():
-        names = [name for name in "RGBA" if name in layers]
-        layers["".join(names)] = _joined([layers.pop(name) for name in names])
-    return Image(path, header, layers, fingerprint)
+    return {name: channel.pixels for name, channel in file.channels(0).items()}
 
 
 def _placed(values: NDArray[Any], first: tuple[int, int], header: Header) -> NDArray[Any]:

@@ -301,11 +301,11 @@ def test_a_large_files_fingerprint_is_its_contents_too(size, tmp_path):
     assert fingerprint_file(tmp_path / "a") == fingerprint(content)
 
 
-def test_a_file_is_decoded_by_its_name(tmp_path):
+def test_a_file_is_read_once_or_decoded_by_its_name(tmp_path):
     path = tmp_path / "a file"
     path.write_bytes(b"first")
-    with unchanging(path) as (source, mark):
-        assert (source, mark) == (str(path), fingerprint(b"first"))
+    with unchanging(path) as file:
+        assert file == (b"first", str(path), fingerprint(b"first"))
 
 
 @pytest.mark.parametrize("replaced", [True, False])
@@ -335,8 +335,8 @@ def test_a_file_that_changed_since_its_fingerprint_was_given_is_an_error(tmp_pat
     other.write_bytes(b"other")
     with fingerprinted([path, other, path]) as marks:
         assert marks == [fingerprint(b"first"), fingerprint(b"other"), fingerprint(b"first")]
-        with unchanging(other) as (source, mark):
-            assert (source, mark) == (str(other), marks[1])
+        with unchanging(other) as file:
+            assert file == (b"other", str(other), marks[1])
         path.write_bytes(b"second")
         with pytest.raises(RetryError, match="a: changed while it was read"), unchanging(path):
             pass
@@ -349,8 +349,8 @@ def test_a_file_that_changed_since_its_fingerprint_was_given_is_an_error(tmp_pat
 def test_a_name_in_no_encoding_is_decoded_from_memory(tmp_path):
     path = tmp_path / os.fsdecode(b"\xff.exr")
     path.write_bytes(b"first")
-    with unchanging(path) as (source, mark):
-        assert (source.read(9), mark) == (b"first", fingerprint(b"first"))
+    with unchanging(path) as file:
+        assert (file.source.read(9), file.fingerprint) == (b"first", fingerprint(b"first"))
 
 
 def test_a_fault_of_the_machine_while_reading_is_worth_a_retry(tmp_path, monkeypatch):
@@ -361,7 +361,11 @@ def test_a_fault_of_the_machine_while_reading_is_worth_a_retry(tmp_path, monkeyp
         def readinto(self, buffer):
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
+    def failing(path):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
     monkeypatch.setattr("io.FileIO", Failing)
+    monkeypatch.setattr(Path, "read_bytes", failing)
     with pytest.raises(RetryError, match="a: cannot read"):
         fingerprint_file(path)
     with pytest.raises(RetryError, match="a: cannot read"), unchanging(path):

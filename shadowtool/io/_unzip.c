@@ -1,0 +1,144 @@
+/* Undoes OpenEXR's ZIP for all chunks of a picture, without Python in between.
+ *
+ * Before a chunk is deflated its bytes are sorted, those at even places before those at odd ones,
+ * and each but the first is stored as its difference to the one before, plus 128. To add them up
+ * again is a running sum of bytes, for which numpy has no fast way, and which OpenEXR as it is
+ * built for Python does byte by byte.
+ */
+
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030B0000
+#include <Python.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+#ifdef __SSE2__
+#include <emmintrin.h>
+#endif
+
+static void add_up(uint8_t *bytes, Py_ssize_t size)
+{
+    uint8_t sum = 128;
+    Py_ssize_t at = 0;
+#ifdef __SSE2__
+    const __m128i offset = _mm_set1_epi8((char)128);
+    __m128i before = offset;
+    for (; at + 16 <= size; at += 16) {
+        __m128i sums = _mm_xor_si128(_mm_loadu_si128((__m128i *)(bytes + at)), offset);
+        sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 1));
+        sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 2));
+        sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 4));
+        sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 8));
+        _mm_storeu_si128((__m128i *)(bytes + at), _mm_add_epi8(sums, before));
+        /* The last of them in every place: only one addition waits for the round before. */
+        __m128i last = _mm_srli_si128(sums, 15);
+        last = _mm_shufflelo_epi16(_mm_unpacklo_epi8(last, last), 0);
+        before = _mm_add_epi8(before, _mm_unpacklo_epi64(last, last));
+    }
+    if (at)
+        sum = bytes[at - 1];
+#endif
+    for (; at < size; at++) {
+        sum = (uint8_t)(sum + bytes[at] - 128);
+        bytes[at] = sum;
+    }
+}
+
+static void weave(const uint8_t *even, const uint8_t *odd, uint8_t *target, Py_ssize_t size)
+{
+    Py_ssize_t pairs = size / 2, pair = 0;
+#ifdef __SSE2__
+    for (; pair + 16 <= pairs; pair += 16) {
+        __m128i first = _mm_loadu_si128((const __m128i *)(even + pair));
+        __m128i second = _mm_loadu_si128((const __m128i *)(odd + pair));
+        __m128i *place = (__m128i *)(target + 2 * pair);
+        _mm_storeu_si128(place, _mm_unpacklo_epi8(first, second));
+        _mm_storeu_si128(place + 1, _mm_unpackhi_epi8(first, second));
+    }
+#endif
+    for (; pair < pairs; pair++) {
+        target[2 * pair] = even[pair];
+        target[2 * pair + 1] = odd[pair];
+    }
+    if (size % 2)
+        target[size - 1] = even[pairs];
+}
+
+/* OpenEXR's exr_uncompress_buffer: context, source, target, and how much came of it. */
+typedef int32_t (*inflate_t)(const void *, const void *, size_t, void *, size_t, size_t *);
+
+/* How many chunks from the first on are whole. */
+static Py_ssize_t unzip(inflate_t inflate, const Py_buffer *data, const Py_buffer *places,
+                        const Py_buffer *target, Py_ssize_t size, uint8_t *scratch)
+{
+    const int64_t *place = places->buf;
+    Py_ssize_t chunks = places->len / (Py_ssize_t)(2 * sizeof(int64_t));
+    for (Py_ssize_t chunk = 0; chunk < chunks; chunk++, place += 2) {
+        int64_t start = place[0], stored = place[1];
+        if (start < 0 || stored < 1 || start > data->len || stored > data->len - start)
+            return chunk;
+        if (chunk >= (target->len + size - 1) / size)
+            return chunk;
+        const uint8_t *source = (const uint8_t *)data->buf + start;
+        uint8_t *bytes = (uint8_t *)target->buf + chunk * size;
+        Py_ssize_t left = target->len - chunk * size, expected = left < size ? left : size;
+        size_t inflated = 0;
+        if (stored == expected) {
+            memcpy(bytes, source, (size_t)expected);
+            continue;
+        }
+        if (inflate(NULL, source, (size_t)stored, scratch, (size_t)expected, &inflated) ||
+            inflated != (size_t)expected)
+            return chunk;
+        add_up(scratch, expected);
+        weave(scratch, scratch + (expected + 1) / 2, bytes, expected);
+    }
+    return chunks;
+}
+
+static PyObject *py_unzip(PyObject *module, PyObject *arguments)
+{
+    PyObject *address;
+    Py_buffer data, places, target;
+    Py_ssize_t size, done = 0;
+    (void)module;
+    if (!PyArg_ParseTuple(arguments, "O!y*y*w*n", &PyLong_Type, &address, &data, &places, &target,
+                          &size))
+        return NULL;
+    inflate_t inflate = (inflate_t)PyLong_AsVoidPtr(address);
+    uint8_t *scratch;
+    if (size > target.len)
+        size = target.len;
+    if (!inflate || size < 1) {
+        if (!PyErr_Occurred())
+            PyErr_SetString(PyExc_ValueError, "nothing to inflate with, or to");
+    } else if (!(scratch = malloc((size_t)size))) {
+        PyErr_NoMemory();
+    } else {
+        Py_BEGIN_ALLOW_THREADS
+        done = unzip(inflate, &data, &places, &target, size, scratch);
+        Py_END_ALLOW_THREADS
+        free(scratch);
+    }
+    PyBuffer_Release(&data);
+    PyBuffer_Release(&places);
+    PyBuffer_Release(&target);
+    return PyErr_Occurred() ? NULL : PyLong_FromSsize_t(done);
+}
+
+static PyMethodDef methods[] = {
+    {"unzip", py_unzip, METH_VARARGS,
+     "unzip(inflate, data, places, target, size): how many chunks from the first on are whole.\n\n"
+     "inflate is the address of OpenEXR's exr_uncompress_buffer, places holds start and size in\n"
+     "data of each chunk as int64, and target takes size bytes of each, the last one the rest."},
+    {NULL, NULL, 0, NULL},
+};
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, "_unzip", NULL, 0, methods, NULL, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit__unzip(void)
+{
+    return PyModule_Create(&definition);
+}

@@ -1,0 +1,267 @@
+"""EXR scanlines decoded here: as OpenEXR decodes them, or not at all."""
+
+import contextlib
+import os
+import struct
+import sys
+import zlib
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shadowtool.errors import ShadowtoolError
+from shadowtool.io import scanlines
+from shadowtool.io.image import read_image
+from shadowtool.io.openexr_core import inflating
+
+_unzip = scanlines._unzip
+pytestmark = pytest.mark.skipif(_unzip is None, reason="it was installed without a compiler")
+
+KINDS = {"e": np.float16, "f": np.float32, "I": np.uint32}
+NONE, ZIPS, ZIP = OpenEXR.NO_COMPRESSION, OpenEXR.ZIPS_COMPRESSION, OpenEXR.ZIP_COMPRESSION
+
+
+def encoded(path: Path, channels: dict[str, Any], **header: Any) -> bytes:
+    basic = {"compression": ZIP, "type": OpenEXR.scanlineimage}
+    OpenEXR.File({**basic, **header}, dict(channels)).write(os.fspath(path))
+    return path.read_bytes()
+
+
+def of_openexr(path: Path) -> dict[str, np.ndarray]:
+    channels = OpenEXR.File(os.fspath(path), separate_channels=True).channels()
+    return {name: channel.pixels for name, channel in channels.items()}
+
+
+def same(found: np.ndarray, expected: np.ndarray) -> bool:
+    return found.dtype == expected.dtype and found.tobytes() == expected.tobytes()
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(1)
+    path = tmp_path / "plain.exr"
+    encoded(path, {"RGB": (rng.integers(0, 90, (40, 30, 3)) / 90).astype("f2")})
+    return path
+
+
+@given(
+    size=st.tuples(st.integers(1, 50), st.integers(1, 40)),
+    kinds=st.dictionaries(
+        st.sampled_from(["R", "G", "B", "A", "Y", "confidence", "Z"]),
+        st.sampled_from("efI"),
+        min_size=1,
+    ),
+    compression=st.sampled_from([NONE, ZIPS, ZIP]),
+    corner=st.tuples(st.integers(-70, 70), st.integers(-70, 70)),
+    levels=st.sampled_from([1, 3, 1 << 15]),
+    seed=st.integers(0, 99),
+)
+def test_channels_are_those_of_openexr(
+    size, kinds, compression, corner, levels, seed, tmp_path_factory
+):
+    height, width = size
+    rng = np.random.default_rng(seed)
+    channels = {
+        name: rng.integers(0, levels, size).astype(KINDS[kind]) for name, kind in kinds.items()
+    }
+    first = np.array(corner, np.int32)
+    window = first, first + np.array([width - 1, height - 1], np.int32)
+    path = tmp_path_factory.mktemp("exr") / "a.exr"
+    data = encoded(path, channels, compression=compression, dataWindow=window, displayWindow=window)
+    found = scanlines.decode(data, apart=True)
+    assert found is not None
+    expected = of_openexr(path)
+    assert found.keys() == expected.keys()
+    assert all(same(found[name], expected[name]) for name in found)
+
+
+@pytest.mark.parametrize("kind", "efI")
+@pytest.mark.parametrize("names", ["RGB", "RGBA"])
+@pytest.mark.parametrize("height", [1, 16, 63, 64, 65, 200])
+def test_colour_of_one_type_is_one_array(kind, names, height, tmp_path):
+    rng = np.random.default_rng(height)
+    pixels = rng.integers(0, 1000, (height, 21, len(names))).astype(KINDS[kind])
+    channels = {name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(names)}
+    found = scanlines.decode(encoded(tmp_path / "a.exr", channels))
+    assert found is not None
+    assert list(found) == [names]
+    assert same(found[names], pixels)
+
+
+def test_colour_with_something_beside_it_is_left_apart(tmp_path):
+    one = np.ones((5, 4), np.float16)
+    found = scanlines.decode(encoded(tmp_path / "a.exr", dict.fromkeys("RGBZ", one)))
+    assert found is not None
+    assert sorted(found) == ["B", "G", "R", "Z"]
+
+
+def test_values_that_no_arithmetic_may_touch_come_back(tmp_path):
+    every = np.arange(1 << 16, dtype=np.uint16).view(np.float16).reshape(256, 256)
+    for channels in ({"Y": every}, dict.fromkeys("RGB", every)):
+        found = scanlines.decode(encoded(tmp_path / "a.exr", channels), apart=True)
+        assert found is not None
+        assert all(same(values, every) for values in found.values())
+
+
+@pytest.mark.parametrize("compression", ["RLE", "PIZ", "PXR24", "B44", "DWAA"])
+def test_other_compressions_are_left_to_openexr(compression, tmp_path):
+    kind = getattr(OpenEXR, f"{compression}_COMPRESSION")
+    pixels = np.ones((20, 20), np.float16)
+    assert scanlines.decode(encoded(tmp_path / "a.exr", {"Y": pixels}, compression=kind)) is None
+
+
+@pytest.mark.parametrize("names", [("r", "g", "b"), ("left.R", "left.G", "left.B"), ("a",)])
+def test_names_that_openexr_joins_are_left_to_it(names, tmp_path):
+    pixels = np.ones((20, 20), np.float16)
+    assert scanlines.decode(encoded(tmp_path / "a.exr", dict.fromkeys(names, pixels))) is None
+
+
+def test_tiles_parts_and_subsampled_channels_are_left_to_openexr(tmp_path):
+    pixels = np.ones((64, 64), np.float16)
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 32
+    data = encoded(tmp_path / "a.exr", {"Y": pixels}, type=OpenEXR.tiledimage, tiles=tiles)
+    assert scanlines.decode(data) is None
+    parts = [OpenEXR.Part({"compression": ZIP}, {"Y": pixels}, name) for name in "ab"]
+    OpenEXR.File(parts).write(os.fspath(tmp_path / "b.exr"))
+    assert scanlines.decode((tmp_path / "b.exr").read_bytes()) is None
+    sparse = OpenEXR.Channel(pixels[:32, :32].copy(), 2, 2)
+    data = encoded(tmp_path / "c.exr", {"X": pixels[:32, :32].copy(), "Y": sparse})
+    assert scanlines.decode(data) is None
+
+
+def test_a_file_cut_off_anywhere_is_not_decoded(plain):
+    data = plain.read_bytes()
+    assert scanlines.decode(data) is not None
+    assert all(scanlines.decode(data[:length]) is None for length in range(len(data)))
+
+
+@contextlib.contextmanager
+def left_to_openexr() -> Iterator[None]:
+    """As where no compiler was there."""
+    here, scanlines._unzip = scanlines._unzip, None
+    try:
+        yield
+    finally:
+        scanlines._unzip = here
+
+
+def outcome(path: Path) -> Any:
+    """What comes of reading: the layers, or what is wrong."""
+    try:
+        layers = read_image(path).layers
+    except ShadowtoolError as error:
+        return repr(error)
+    return {name: (str(v.dtype), v.shape, v.tobytes()) for name, v in layers.items()}
+
+
+@settings(max_examples=400)
+@given(
+    place=st.floats(0, 1, exclude_max=True),
+    bit=st.integers(0, 7),
+    compression=st.sampled_from([NONE, ZIPS, ZIP]),
+)
+def test_a_flipped_bit_anywhere_comes_to_what_openexr_makes_of_it(
+    place, bit, compression, tmp_path_factory
+):
+    path = tmp_path_factory.mktemp("exr") / "a.exr"
+    pixels = np.random.default_rng(1).integers(0, 90, (33, 5)).astype("f2")
+    data = bytearray(encoded(path, dict.fromkeys("YZ", pixels), compression=compression))
+    data[int(place * len(data))] ^= 1 << bit
+    path.write_bytes(data)
+    with left_to_openexr():
+        expected = outcome(path)
+    assert outcome(path) == expected
+
+
+def test_without_a_compiler_everything_is_left_to_openexr(plain):
+    expected = outcome(plain)
+    with left_to_openexr():
+        assert scanlines.decode(plain.read_bytes()) is None
+        assert outcome(plain) == expected
+
+
+def test_an_openexr_that_hides_its_inflating_does_it_all(plain, monkeypatch):
+    expected = outcome(plain)
+    monkeypatch.setattr(OpenEXR, "__file__", os.fspath(plain))
+    assert inflating() is None
+    assert scanlines.decode(plain.read_bytes()) is None
+    assert outcome(plain) == expected
+
+
+def predicted(rows: bytes) -> bytes:
+    """The bytes as OpenEXR deflates them, slowly."""
+    ordered = rows[::2] + rows[1::2]
+    return ordered[:1] + bytes((b - a + 128) & 255 for a, b in pairwise(ordered))
+
+
+@pytest.mark.parametrize("size", [*range(1, 70), 1000, 1001])
+def test_a_chunk_of_any_size_is_put_in_order(size):
+    rows = np.random.default_rng(size).integers(0, 4, size, np.uint8).tobytes()
+    # What is as long as the rows counts as stored as it is.
+    levels = (zlib.compress(predicted(rows), level) for level in (9, 0))
+    stored = next(data for data in levels if len(data) != size)
+    target = np.zeros(size, np.uint8)
+    inflate = inflating()
+    assert inflate is not None
+    places = np.array([[0, len(stored)]], np.int64)
+    done = _unzip.unzip(inflate, stored, places, target, size)
+    assert (done, target.tobytes()) == (1, rows)
+
+
+@pytest.mark.parametrize(
+    "place", [(-1, 4), (0, 0), (0, -4), (1, 9), (11, 1), (2**62, 2**62), (-(2**63), 2**63 - 1)]
+)
+def test_a_chunk_outside_the_file_is_not_looked_for(place):
+    inflate = inflating()
+    assert inflate is not None
+    places = np.array([[0, 4], place], np.int64)
+    target = np.zeros(8, np.uint8)
+    assert _unzip.unzip(inflate, bytes(9), places, target, 4) == 1
+
+
+def test_more_chunks_than_there_is_room_for_are_not_written():
+    inflate = inflating()
+    assert inflate is not None
+    memory = np.full(8, 7, np.uint8)
+    places = np.array([[0, 2]] * 9, np.int64)
+    assert _unzip.unzip(inflate, bytes(2), places, memory[:4], 2) == 2
+    assert memory.tolist() == [0] * 4 + [7] * 4
+
+
+def test_what_inflates_to_more_or_less_is_damaged():
+    inflate = inflating()
+    assert inflate is not None
+    stored = zlib.compress(bytes(100))
+    places = np.array([[0, len(stored)]], np.int64)
+    for size, done in ((99, 0), (100, 1), (101, 0)):
+        memory = np.zeros(size, np.uint8)
+        assert _unzip.unzip(inflate, stored, places, memory, size) == done
+
+
+@pytest.mark.parametrize("address, size", [(0, 4), (1, 0), (1, -1)])
+def test_nothing_to_inflate_with_is_an_error(address, size):
+    with pytest.raises(ValueError, match="nothing to inflate"):
+        _unzip.unzip(address, b"", np.zeros((0, 2), np.int64), np.zeros(4, np.uint8), size)
+
+
+def test_an_attribute_that_stands_there_twice_is_left_to_openexr(plain):
+    data = plain.read_bytes()
+    again = b"dataWindow\0box2i\0" + struct.pack("<5i", 16, 0, 0, 1, 1)
+    assert scanlines.decode(data[:8] + again + data[8:]) is None
+
+
+def test_a_header_that_claims_more_than_the_file_can_hold_asks_for_no_memory(plain):
+    data = bytearray(plain.read_bytes())
+    at = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    data[at : at + 16] = struct.pack("<4i", 0, 0, 2**31 - 2, 2**31 - 2)
+    before = sys.getallocatedblocks()
+    assert scanlines.decode(bytes(data)) is None
+    assert sys.getallocatedblocks() - before < 1000

@@ -67,70 +67,84 @@ static void weave(const uint8_t *even, const uint8_t *odd, uint8_t *target, Py_s
 /* OpenEXR's exr_uncompress_buffer: context, source, target, and how much came of it. */
 typedef int32_t (*inflate_t)(const void *, const void *, size_t, void *, size_t, size_t *);
 
-/* How many chunks from the first on are whole. */
-static Py_ssize_t unzip(inflate_t inflate, const Py_buffer *data, const Py_buffer *places,
-                        const Py_buffer *target, Py_ssize_t size, uint8_t *scratch)
+/* Which rows a picture has, and how they lie in a file. */
+typedef struct {
+    int32_t top;       /* the number of the first row */
+    Py_ssize_t rows;   /* in a chunk */
+    Py_ssize_t length; /* bytes of a row */
+} layout_t;
+
+/* How many chunks from the first on are whole, and where they should be. */
+static Py_ssize_t unzip(inflate_t inflate, const Py_buffer *data, const Py_buffer *table,
+                        const Py_buffer *target, const layout_t *layout, uint8_t *scratch)
 {
-    const int64_t *place = places->buf;
-    Py_ssize_t chunks = places->len / (Py_ssize_t)(2 * sizeof(int64_t));
-    for (Py_ssize_t chunk = 0; chunk < chunks; chunk++, place += 2) {
-        int64_t start = place[0], stored = place[1];
-        if (start < 0 || stored < 1 || start > data->len || stored > data->len - start)
+    const uint8_t *file = data->buf;
+    Py_ssize_t chunks = table->len / 8, size = layout->rows * layout->length, chunk;
+    for (chunk = 0; chunk < chunks && chunk * size < target->len; chunk++) {
+        /* Its place in the file; there, the number of its first row and how much is stored. */
+        uint64_t start;
+        int32_t number, stored;
+        memcpy(&start, (const uint8_t *)table->buf + 8 * chunk, 8);
+        if (data->len < 8 || start > (uint64_t)data->len - 8)
             return chunk;
-        if (chunk >= (target->len + size - 1) / size)
+        memcpy(&number, file + start, 4);
+        memcpy(&stored, file + start + 4, 4);
+        start += 8;
+        if (number != layout->top + chunk * layout->rows || stored < 1 ||
+            (uint64_t)stored > (uint64_t)data->len - start)
             return chunk;
-        const uint8_t *source = (const uint8_t *)data->buf + start;
         uint8_t *bytes = (uint8_t *)target->buf + chunk * size;
         Py_ssize_t left = target->len - chunk * size, expected = left < size ? left : size;
         size_t inflated = 0;
         if (stored == expected) {
-            memcpy(bytes, source, (size_t)expected);
+            memcpy(bytes, file + start, (size_t)expected);
             continue;
         }
-        if (inflate(NULL, source, (size_t)stored, scratch, (size_t)expected, &inflated) ||
+        if (!inflate ||
+            inflate(NULL, file + start, (size_t)stored, scratch, (size_t)expected, &inflated) ||
             inflated != (size_t)expected)
             return chunk;
         add_up(scratch, expected);
         weave(scratch, scratch + (expected + 1) / 2, bytes, expected);
     }
-    return chunks;
+    return chunk;
 }
 
 static PyObject *py_unzip(PyObject *module, PyObject *arguments)
 {
     PyObject *address;
-    Py_buffer data, places, target;
-    Py_ssize_t size, done = 0;
+    Py_buffer data, table, target;
+    layout_t layout;
+    Py_ssize_t done = 0;
     (void)module;
-    if (!PyArg_ParseTuple(arguments, "O!y*y*w*n", &PyLong_Type, &address, &data, &places, &target,
-                          &size))
+    if (!PyArg_ParseTuple(arguments, "O!y*y*w*inn", &PyLong_Type, &address, &data, &table, &target,
+                          &layout.top, &layout.rows, &layout.length))
         return NULL;
     inflate_t inflate = (inflate_t)PyLong_AsVoidPtr(address);
-    uint8_t *scratch;
-    if (size > target.len)
-        size = target.len;
-    if (!inflate || size < 1) {
-        if (!PyErr_Occurred())
-            PyErr_SetString(PyExc_ValueError, "nothing to inflate with, or to");
-    } else if (!(scratch = malloc((size_t)size))) {
+    uint8_t *scratch = NULL;
+    if (!PyErr_Occurred() && (layout.rows < 1 || layout.length < 1))
+        PyErr_SetString(PyExc_ValueError, "chunks without rows, or rows without bytes");
+    if (!PyErr_Occurred() && !(scratch = malloc((size_t)(layout.rows * layout.length))))
         PyErr_NoMemory();
-    } else {
+    if (!PyErr_Occurred()) {
         Py_BEGIN_ALLOW_THREADS
-        done = unzip(inflate, &data, &places, &target, size, scratch);
+        done = unzip(inflate, &data, &table, &target, &layout, scratch);
         Py_END_ALLOW_THREADS
-        free(scratch);
     }
+    free(scratch);
     PyBuffer_Release(&data);
-    PyBuffer_Release(&places);
+    PyBuffer_Release(&table);
     PyBuffer_Release(&target);
     return PyErr_Occurred() ? NULL : PyLong_FromSsize_t(done);
 }
 
 static PyMethodDef methods[] = {
     {"unzip", py_unzip, METH_VARARGS,
-     "unzip(inflate, data, places, target, size): how many chunks from the first on are whole.\n\n"
-     "inflate is the address of OpenEXR's exr_uncompress_buffer, places holds start and size in\n"
-     "data of each chunk as int64, and target takes size bytes of each, the last one the rest."},
+     "unzip(inflate, data, table, target, top, rows, length): how many chunks from the first on\n"
+     "are whole.\n\n"
+     "inflate is the address of OpenEXR's exr_uncompress_buffer, or 0 for chunks that are stored\n"
+     "as they are; table holds each one's place in data as uint64. Into target go rows of so many\n"
+     "bytes, so many of them from each chunk; the first has the number top."},
     {NULL, NULL, 0, NULL},
 };
 

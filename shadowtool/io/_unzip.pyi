@@ -1,8 +1,13 @@
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 def unzip(
-    inflate: int, data: bytes, places: NDArray[np.int64], target: NDArray[Any], size: int
+    inflate: int,
+    data: bytes,
+    table: memoryview,
+    target: NDArray[Any],
+    top: int,
+    rows: int,
+    length: int,
 ) -> int: ...

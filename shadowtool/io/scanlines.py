@@ -25,7 +25,6 @@ except ImportError:
     _unzip = None  # type: ignore[assignment]
 
 Bytes = NDArray[np.uint8]
-Places = NDArray[np.int64]
 
 _MAGIC = b"v/1\x01"
 # The version, and a flag that says nothing but that names may be long: one part, in scanlines.
@@ -114,12 +113,12 @@ def decode(data: bytes, apart: bool = False) -> dict[str, NDArray[Any]] | None:
         return None
     with contextlib.suppress(struct.error, ValueError, LookupError):
         layout = _layout(data)
-        places = _places(data, layout)
+        chunks = _Chunks(data, layout, inflate if layout.packed else 0)
         colour = layout.colour()
         if colour and not apart:
-            return {colour: _joined(data, inflate, layout, places, colour)}
+            return {colour: _joined(chunks, layout, colour)}
         rows = np.empty((layout.height, layout.length), np.uint8)
-        _fill(rows, data, inflate, layout, places)
+        chunks.fill(rows)
         return {name: layout.values(rows, name) for name in layout.channels}
     return None
 
@@ -174,47 +173,43 @@ def _channels(listed: bytes, width: int) -> tuple[dict[str, _Place], int]:
     return channels, length
 
 
-def _places(data: bytes, layout: _Layout) -> Places:
-    """Where each chunk's bytes start and how many are stored, (chunks, 2).
+class _Chunks:
+    """A file's chunks, each of them some rows.
 
     Raises:
-        ValueError, struct.error: the file isn't whole.
+        ValueError: the file isn't whole.
     """
-    if layout.height * layout.length > _MOST_INFLATED * len(data):
-        raise ValueError("more pixels than the file has room for")
-    places = np.empty((-(-layout.height // layout.rows), 2), np.int64)
-    for index, start in enumerate(struct.unpack_from(f"<{len(places)}Q", data, layout.table)):
-        number, stored = struct.unpack_from("<ii", data, min(start, len(data)))
-        wrong = not layout.packed and stored != layout.length
-        if wrong or number != layout.top + index * layout.rows:
-            raise ValueError("a chunk is not where it should be")
-        places[index] = start + 8, stored
-    return places
+
+    def __init__(self, data: bytes, layout: _Layout, inflate: int) -> None:
+        if layout.height * layout.length > _MOST_INFLATED * len(data):
+            raise ValueError("more pixels than the file has room for")
+        self.count = -(-layout.height // layout.rows)
+        # Where each starts.
+        self._table = memoryview(data)[layout.table : layout.table + 8 * self.count]
+        self._data, self._layout, self._inflate = data, layout, inflate
+
+    def fill(self, rows: Bytes, first: int = 0) -> None:
+        """Decode rows, (N, bytes of a row), from a chunk on. Raises as the class does."""
+        layout = self._layout
+        count = -(-len(rows) // layout.rows)
+        table = self._table[8 * first : 8 * (first + count)]
+        top = layout.top + first * layout.rows
+        arguments = self._data, table, rows, top, layout.rows, layout.length
+        if _unzip.unzip(self._inflate, *arguments) != count:
+            raise ValueError("a chunk is damaged, or missing")
 
 
-def _fill(rows: Bytes, data: bytes, inflate: int, layout: _Layout, places: Places) -> None:
-    """Decode chunks into rows, (N, bytes of a row).
-
-    Raises:
-        ValueError: one is damaged.
-    """
-    size = layout.rows * layout.length
-    if _unzip.unzip(inflate, data, places, rows, size) != len(places):
-        raise ValueError("a chunk is damaged")
-
-
-def _joined(data: bytes, inflate: int, layout: _Layout, places: Places, names: str) -> NDArray[Any]:
-    """Channels of one type as one array (H, W, C). Raises as `_fill`."""
+def _joined(chunks: _Chunks, layout: _Layout, names: str) -> NDArray[Any]:
+    """Channels of one type as one array (H, W, C). Raises as `_Chunks` does."""
     kind = layout.channels[names[0]].kind
     joined = np.empty((layout.height, layout.width, len(names)), kind)
     # What only moves channels about takes halfs as integers of their size.
     bits: NDArray[np.integer[Any]]
     bits = joined.view(np.uint16 if kind.itemsize == 2 else np.int32)
     band = np.empty((min(_BAND * layout.rows, layout.height), layout.length), np.uint8)
-    for first in range(0, len(places), _BAND):
-        lines = slice(first * layout.rows, (first + _BAND) * layout.rows)
-        target = bits[lines]
+    for first in range(0, chunks.count, _BAND):
+        target = bits[first * layout.rows : (first + _BAND) * layout.rows]
         rows = band[: len(target)]
-        _fill(rows, data, inflate, layout, places[first : first + _BAND])
+        chunks.fill(rows, first)
         cv2.merge([layout.values(rows, name).view(bits.dtype) for name in names], dst=target)
     return joined

@@ -202,6 +202,14 @@ def predicted(rows: bytes) -> bytes:
     return ordered[:1] + bytes((b - a + 128) & 255 for a, b in pairwise(ordered))
 
 
+def chunk(number: int, stored: bytes) -> bytes:
+    return struct.pack("<ii", number, len(stored)) + stored
+
+
+def table(*places: int) -> memoryview:
+    return memoryview(np.array(places, np.uint64).tobytes())
+
+
 @pytest.mark.parametrize("size", [*range(1, 70), 1000, 1001])
 def test_a_chunk_of_any_size_is_put_in_order(size):
     rows = np.random.default_rng(size).integers(0, 4, size, np.uint8).tobytes()
@@ -211,45 +219,55 @@ def test_a_chunk_of_any_size_is_put_in_order(size):
     target = np.zeros(size, np.uint8)
     inflate = inflating()
     assert inflate is not None
-    places = np.array([[0, len(stored)]], np.int64)
-    done = _unzip.unzip(inflate, stored, places, target, size)
-    assert (done, target.tobytes()) == (1, rows)
+    assert _unzip.unzip(inflate, chunk(7, stored), table(0), target, 7, 1, size) == 1
+    assert target.tobytes() == rows
 
 
-@pytest.mark.parametrize(
-    "place", [(-1, 4), (0, 0), (0, -4), (1, 9), (11, 1), (2**62, 2**62), (-(2**63), 2**63 - 1)]
-)
-def test_a_chunk_outside_the_file_is_not_looked_for(place):
-    inflate = inflating()
-    assert inflate is not None
-    places = np.array([[0, 4], place], np.int64)
-    target = np.zeros(8, np.uint8)
-    assert _unzip.unzip(inflate, bytes(9), places, target, 4) == 1
+@pytest.mark.parametrize("place", [1, 2, 4, 12, 13, 21, 2**31, 2**63, 2**64 - 1, 2**64 - 8])
+def test_a_chunk_that_is_not_where_it_should_be_is_not_taken(place):
+    data = chunk(0, b"1234") + chunk(2, b"5678")[:-1]
+    target = np.zeros(16, np.uint8)
+    assert _unzip.unzip(0, data, table(0, place), target, 0, 2, 2) == 1
+    assert target.tobytes() == b"1234" + bytes(12)
 
 
-def test_more_chunks_than_there_is_room_for_are_not_written():
-    inflate = inflating()
-    assert inflate is not None
+@pytest.mark.parametrize("number, stored", [(1, 4), (0, 0), (0, -4), (0, 5), (0, 2**31 - 1)])
+def test_a_chunk_that_says_something_else_of_itself_is_not_taken(number, stored):
+    data = struct.pack("<ii", number, stored) + b"1234"
+    assert _unzip.unzip(0, data, table(0), np.zeros(4, np.uint8), 0, 1, 4) == 0
+    assert _unzip.unzip(0, chunk(0, b"1234"), table(0), np.zeros(4, np.uint8), 0, 1, 4) == 1
+
+
+@pytest.mark.parametrize("length", range(8))
+def test_a_file_shorter_than_a_chunk_begins_has_none(length):
+    assert _unzip.unzip(0, bytes(length), table(0), np.zeros(4, np.uint8), 0, 1, 4) == 0
+
+
+def test_chunks_for_which_there_is_no_room_are_not_taken():
     memory = np.full(8, 7, np.uint8)
-    places = np.array([[0, 2]] * 9, np.int64)
-    assert _unzip.unzip(inflate, bytes(2), places, memory[:4], 2) == 2
-    assert memory.tolist() == [0] * 4 + [7] * 4
+    data = b"".join(chunk(number, b"12") for number in range(9))
+    places = table(*range(0, 90, 10))
+    assert _unzip.unzip(0, data, places, memory[:3], 0, 1, 2) == 1
+    assert memory.tobytes() == b"12" + bytes([7] * 6)
+    # The last one is what is left.
+    data = chunk(0, b"12") + chunk(1, b"3")
+    assert _unzip.unzip(0, data, table(0, 10), memory[:3], 0, 1, 2) == 2
+    assert memory.tobytes() == b"123" + bytes([7] * 5)
 
 
 def test_what_inflates_to_more_or_less_is_damaged():
     inflate = inflating()
     assert inflate is not None
-    stored = zlib.compress(bytes(100))
-    places = np.array([[0, len(stored)]], np.int64)
+    stored = chunk(0, zlib.compress(bytes(100)))
     for size, done in ((99, 0), (100, 1), (101, 0)):
         memory = np.zeros(size, np.uint8)
-        assert _unzip.unzip(inflate, stored, places, memory, size) == done
+        assert _unzip.unzip(inflate, stored, table(0), memory, 0, 1, size) == done
 
 
-@pytest.mark.parametrize("address, size", [(0, 4), (1, 0), (1, -1)])
-def test_nothing_to_inflate_with_is_an_error(address, size):
-    with pytest.raises(ValueError, match="nothing to inflate"):
-        _unzip.unzip(address, b"", np.zeros((0, 2), np.int64), np.zeros(4, np.uint8), size)
+@pytest.mark.parametrize("rows, length", [(0, 4), (4, 0), (-1, 4), (4, -1)])
+def test_chunks_of_nothing_are_an_error(rows, length):
+    with pytest.raises(ValueError, match="without"):
+        _unzip.unzip(0, b"", table(), np.zeros(4, np.uint8), 0, rows, length)
 
 
 def test_an_attribute_that_stands_there_twice_is_left_to_openexr(plain):

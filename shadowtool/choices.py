@@ -1,4 +1,4 @@
-"""The words that options take: one table for the code and for the command line.
+"""The words that options take, and defaults: one table for the code and for the command line.
 
 It imports nothing heavy, so that ``--help`` answers at once.
 """
@@ -28,3 +28,6 @@ READINGS: tuple[str, ...] = get_args(Reading)
 STEADY: tuple[str, ...] = get_args(Steady)
 TRANSFER_NAMES: tuple[str, ...] = get_args(TransferName)
 PROGRESS: tuple[str, ...] = get_args(Progress)
+
+# Of the diffusion that smooths a map; and the value of what a map points to outside the frame.
+ITERATIONS, OUTSIDE = 5, 1.0

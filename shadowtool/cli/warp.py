@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from shadowtool.choices import ITERATIONS, OUTSIDE
 from shadowtool.cli.options import step_command
 
 
@@ -29,14 +30,14 @@ from shadowtool.cli.options import step_command
 @click.option(
     "--outside",
     type=float,
-    default=1.0,
+    default=OUTSIDE,
     show_default=True,
     help="With --apply, the value where the map points outside the frame.",
 )
 @click.option(
     "--iterations",
     type=click.IntRange(min=0, max=10_000),
-    default=5,
+    default=ITERATIONS,
     show_default=True,
     help="Steps of the diffusion that smooths the map.",
 )

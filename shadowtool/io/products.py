@@ -268,6 +268,19 @@ def write_warp(path: Path, warp_map: WarpMap, header: Header, provenance: Proven
     write_exr(path, {"RGBA": layers}, header, provenance)
 
 
+def map_place(path: Path) -> Path:
+    """The ST map that a path stands for: the one in a folder of `warp`, or the file itself."""
+    with contextlib.suppress(OSError):
+        if path.is_dir():
+            return path / WARP
+    return path
+
+
+def made_by(header: Header, step: str) -> bool:
+    """Whether a file says that this step of ours wrote it."""
+    return header.provenance.get("command", "").split()[:2] == ["shadowtool", step]
+
+
 def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
     """Read an ST map as W in pixels of a source picture of the map's own size.
 

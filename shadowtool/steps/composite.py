@@ -29,7 +29,7 @@ from shadowtool.io.image import (
     write_exr,
     write_png,
 )
-from shadowtool.io.products import WARP, read_plates, read_warp
+from shadowtool.io.products import made_by, map_place, read_plates, read_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_frames, require_size, say_taken_as
 from shadowtool.steps.matte import BETA_FOLDER, FIGURE_FOLDER
@@ -92,7 +92,7 @@ def composite(
     places: Float32 | None = None
     shared = [stored.fingerprint]
     if warp is not None:
-        warp = warp / WARP if warp.is_dir() else warp
+        warp = map_place(warp)
         places, mark = _places(warp, header, f"the plates in {plates}")
         shared.append(mark)
     suffix = EXR if file_format == "exr" else PNG
@@ -188,6 +188,10 @@ def _places(warp: Path, header: Header, of: str) -> tuple[Float32, str]:
 def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:
     """β of a frame, (H, W) or (H, W, 3), and how many of its pixels are unknown."""
     image = read_image(sequence.path(frame))
+    if "RGBA" in image.layers and made_by(image.header, "matte"):
+        raise InputError(
+            f"{image.path}: is the figure that matte wrote, no β; give the frames in {BETA_FOLDER}/"
+        )
     coloured = not image.layers.keys().isdisjoint({"RGB", "RGBA"})
     values = to_float(image.rgb("none")) if coloured else image.plane("Y")
     holes = ~np.isfinite(values)

@@ -30,10 +30,10 @@ from shadowtool.core.noise import NoiseModel
 from shadowtool.core.plates import Plates
 from shadowtool.core.trembling import UNSTEADY, off_place, strips
 from shadowtool.core.trimap import FIGURE
-from shadowtool.errors import OptionError
+from shadowtool.errors import InputError, OptionError
 from shadowtool.io.files import real
 from shadowtool.io.image import EXR, PNG, Header, Image, read_image, to_half, write_exr, write_png
-from shadowtool.io.products import read_plates
+from shadowtool.io.products import made_by, read_plates
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import (
     Footage,
@@ -376,6 +376,11 @@ class _Take:
     def _figure(self, frame: Frame, shown: _Shown) -> _Figure:
         if self.alpha is not None:
             stored = read_image(self.alpha.path(frame))
+            if "confidence" in stored.layers and made_by(stored.header, "matte"):
+                raise InputError(
+                    f"{stored.path}: is the β that matte wrote, no figure; give the frames in"
+                    f" {FIGURE_FOLDER}/"
+                )
             matte = moved_with(_matte_plane(stored), stored.header, shown.moved)
             matte = np.clip(matte, 0, 1).astype(np.float32, copy=False)
             box = around(matte > 0, MARGIN) or _NONE

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shadowtool.choices import ITERATIONS, OUTSIDE
 from shadowtool.core.bands import bands, in_all_channels
 from shadowtool.core.diffusion import diffuse
 from shadowtool.core.epipole import Epipole
@@ -35,7 +36,15 @@ from shadowtool.io.image import (
     write_exr,
     write_png,
 )
-from shadowtool.io.products import MANIFEST, WARP, read_record, read_scan, read_warp, write_warp
+from shadowtool.io.products import (
+    MANIFEST,
+    WARP,
+    map_place,
+    read_record,
+    read_scan,
+    read_warp,
+    write_warp,
+)
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_size
 from shadowtool.steps.run import (
@@ -74,8 +83,8 @@ def warp(
     map_file: Path | None = None,
     source_scans: list[Path] | None = None,
     apply_to: str | Path | None = None,
-    outside: float = 1.0,
-    iterations: int = 5,
+    outside: float = OUTSIDE,
+    iterations: int = ITERATIONS,
 ) -> list[Result]:
     """Solve a map from scans, or take one that is there, and see frames through it.
 
@@ -85,7 +94,7 @@ def warp(
 
     Args:
         scans: two or more folders of `scan`; none with ``map_file``.
-        map_file: an ST map.
+        map_file: an ST map, or the folder in which one was solved.
         source_scans: two or more scans of the source, if that isn't flat: the map then leads on
             from the reference plane to where the source shows the shadow.
         apply_to: frames to warp.
@@ -97,7 +106,8 @@ def warp(
 
     Raises:
         InputError: scans, map or frames are missing or don't fit.
-        OptionError: neither or both of scans and map, or nothing to do.
+        OptionError: neither or both of scans and map, nothing to do, or an option that would
+            change nothing.
         ReshootError: the passes can't fix any point.
     """
     if bool(scans) == (map_file is not None):
@@ -108,6 +118,12 @@ def warp(
         raise OptionError("a map takes two scans or more, swept at different angles")
     if source_scans and map_file is not None:
         raise OptionError("--source-scan goes with SCAN folders, not with --map")
+    if map_file is not None and iterations != ITERATIONS:
+        raise OptionError("--iterations goes with SCAN folders, not with --map")
+    if apply_to is None and run.frames is not None:
+        raise OptionError("--frames says which frames --apply warps; give --apply FRAMES")
+    if apply_to is None and outside != OUTSIDE:
+        raise OptionError("--outside goes with --apply FRAMES")
     if not abs(outside) <= LARGEST_HALF:
         raise OptionError(f"--outside {outside}: must be a number that a half float can hold")
     if source_scans and len(source_scans) < 2:
@@ -117,7 +133,7 @@ def warp(
         assert applied is not None
         # A folder in which a map was solved keeps the record of that.
         record_in = applied.folder if is_file(output / WARP) else output
-        return [_apply(map_file, applied, record_in, run, outside)]
+        return [_apply(map_place(map_file), applied, record_in, run, outside)]
     results = [_solve(scans, source_scans or [], output, run, iterations)]
     if not results[0].kept:
         now = {applied.folder} if applied else set()

@@ -934,3 +934,46 @@ def test_a_stream_that_is_closed_from_the_start_does_no_harm(stream, shot, tmp_p
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "shadowtool.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--frames", "1001"], "--frames says which frames --apply warps; give --apply FRAMES"),
+        (["--outside", "0"], "--outside goes with --apply FRAMES"),
+    ],
+)
+def test_options_of_applying_without_frames_to_apply_to(options, said, shot, misused):
+    assert said in misused(shot.arguments("warp"), *options)
+
+
+def test_iterations_of_a_map_that_is_there(shot, misused):
+    said = misused(shot.arguments("apply"), "--iterations", 9)
+    assert "--iterations goes with SCAN folders, not with --map" in said
+
+
+def test_a_folder_of_a_map_is_the_map_in_it(shot, command, tmp_path):
+    words = shot.arguments("apply")
+    place = words.index("--map") + 1
+    outcome = command(*replaced(words, place, Path(words[place]).parent), "-o", tmp_path / "out")
+    assert outcome.code == 0, outcome.err
+    assert list((tmp_path / "out").rglob("*.1003.exr"))
+
+
+def test_a_folder_without_a_map(shot, refused, tmp_path):
+    words = shot.arguments("apply")
+    (tmp_path / "maps").mkdir()
+    said = refused(replaced(words, words.index("--map") + 1, tmp_path / "maps"))
+    assert "warp.exr: no such file" in said
+
+
+def test_the_figure_given_for_beta(shot, refused):
+    words = shot.arguments("composite")
+    said = refused(words, "--beta-frames", Path(words[1]) / "fg")
+    assert "fg.1001.exr: is the figure that matte wrote, no β" in said
+
+
+def test_beta_given_for_the_figures_matte(shot, refused):
+    composite = shot.arguments("composite")
+    said = refused(shot.arguments("matte"), "--alpha", Path(composite[1]) / "beta")
+    assert "beta.1001.exr: is the β that matte wrote, no figure" in said

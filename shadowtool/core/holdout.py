@@ -60,10 +60,15 @@ _TEXTURE_RANKS, _AROUND, _LEAST_LIKELY = (0.8, 0.95), 0.3, 0.05
 _CLUSTER, _ROUNDS, _LIGHTEST_RATIO = 2.5, 3, 0.9
 # So many windows down and across, of so many points down and across at least, may have ratios of
 # their own, if they have more than the first part of the ground's texture for certain, and differ
-# by no more than the second, a logarithm.
-_WINDOWS, _LEAST_WINDOW, _CERTAIN, _FURTHEST = (4, 6), 20, 0.15, 1.2
-# Between them ratios go over in so many windows; the common one counts as so much of one.
-_WINDOW_BLUR, _COMMON_WEIGHT = 0.7, 0.1
+# by no more than the second, a logarithm, and in no channel from the others by more than the third
+# for what they differ by and 1: the light that is missing is of one colour.
+_WINDOWS, _LEAST_WINDOW, _CERTAIN, _FURTHEST, _COLOURED = (4, 6), 20, 0.15, 1.2, 0.25
+# Between them ratios lie on planes through those that are so many windows away, a standard
+# deviation. That there is the common one, and no slope down or across, counts as so much of one.
+_NEXT_WINDOWS, _AS_COMMON = 0.8, (0.05, 0.3, 0.3)
+# Where their logarithms differ by more than the first, they are looked for again, so many times in
+# all.
+_EVEN, _LOOKS = 0.15, 3
 # From the first to the second β a sample is neither in light nor in shade, and counts so much.
 _SHADE_ENDS, _LIGHT_BEGINS, _BETWEEN = 0.15, 0.85, 0.75
 # Candidates for L are every so many of a pixel's samples, dark to bright.
@@ -200,6 +205,15 @@ class _Compared(NamedTuple):
         parts = [values.take(points, axis=-1) for values in self[:-1]]
         return _Compared._make([*parts, (len(rows), len(columns))])
 
+    def dimmed(self, shift: Float32) -> "_Compared":
+        """The same beside light that is less by exp(shift), (3, N)."""
+        bright = self.bright * np.exp(shift)
+        less = np.log(np.maximum(self.bright.sum(axis=0), np.float32(1e-4)))
+        less -= np.log(np.maximum(bright.sum(axis=0), np.float32(1e-4)))
+        # What says nothing still does.
+        difference = np.where(self.difference < 1, self.difference + less, self.difference)
+        return self._replace(bright=bright, difference=difference)
+
 
 class _Frequent(NamedTuple):
     """A ratio that is frequent: (3,); how much speaks for it; how many samples have it, and how
@@ -241,30 +255,72 @@ def _common_ratio(
 
 
 def _with_windows(compared: _Compared, common: Float32, noise: NoiseModel) -> Float32:
-    """The ratio of each point, (3, N), between those of windows that have one of their own."""
+    """The ratio of each point, (3, N), as windows have it in common.
+
+    Where it differs much, so that it isn't one in a window either, it is looked for again in what
+    it would be without that.
+    """
+    shift = np.zeros(compared.bright.shape, np.float32)
+    for _ in range(_LOOKS):
+        further = _window_shifts(compared.dimmed(shift), common, noise)
+        shift += further
+        if np.ptp(further) < _EVEN:
+            break
+    ratio = common[:, np.newaxis] * np.exp(shift)
+    return np.ascontiguousarray(np.clip(ratio, 0, _LIGHTEST_RATIO), np.float32)
+
+
+def _window_shifts(compared: _Compared, common: Float32, noise: NoiseModel) -> Float32:
+    """Logarithms of ratios over the common one, (3, N), 0 or less, between those of windows that
+    have a ratio of their own."""
     # Smaller windows have too few samples of anything.
     rows, columns = (
         np.array_split(np.arange(length), max(min(windows, length // _LEAST_WINDOW), 1))
         for length, windows in zip(compared.size, _WINDOWS, strict=True)
     )
-    own = np.zeros((len(rows), len(columns), 4), np.float32)
+    places, shifts, weights = [], [], []
     for i, down in enumerate(rows):
         for j, across in enumerate(columns):
             found = _most_frequent(compared.window(down, across), noise)
             if found is None or found.samples < _TELLING or found.follows <= _CERTAIN:
                 continue
             shift = np.log(np.maximum(found.ratio, 1e-3) / np.maximum(common, 1e-3))
-            if shift.mean() <= -_FURTHEST:
-                continue
-            # What is lighter may be a penumbra, and is on the line as it is.
-            own[i, j, :3] = shift if shift.mean() < 0 else 0
-            own[i, j, 3] = 1
-    own = np.asarray(cv2.GaussianBlur(own, (0, 0), _WINDOW_BLUR), np.float32)
-    shift = own[..., :3] / (own[..., 3:] + np.float32(_COMMON_WEIGHT))
-    height, width = compared.size
-    field = cv2.resize(shift, (width, height), interpolation=cv2.INTER_LINEAR)
-    ratio = common * np.exp(field.reshape(-1, 3))
-    return np.ascontiguousarray(np.clip(ratio, 0, _LIGHTEST_RATIO).T, np.float32)
+            alike = np.ptp(shift) <= _COLOURED * (1 + abs(shift.mean()))
+            if shift.mean() > -_FURTHEST and alike:
+                # What is lighter may be a penumbra, and is on the line as it is.
+                shifts.append(shift if shift.mean() < 0 else np.zeros(3))
+                places.append((i + 0.5, j + 0.5))
+                weights.append(found.follows)
+    if not places:
+        return np.zeros(compared.bright.shape, np.float32)
+    # Nodes at the windows' middles and borders, on straight lines between which the others lie.
+    nodes = [np.linspace(0, len(parts), 2 * len(parts) + 1) for parts in (rows, columns)]
+    field = _local_planes(*map(np.array, (places, shifts, weights)), *nodes)
+    down, across = (
+        np.stack([np.interp(np.linspace(0, own[-1], length), own, one) for one in np.eye(own.size)])
+        for own, length in zip(nodes, compared.size, strict=True)
+    )
+    whole = np.einsum("iy,ijc,jx->cyx", down, np.minimum(field, 0), across, optimize=True)
+    return np.asarray(whole.reshape(3, -1), np.float32)
+
+
+def _local_planes(
+    places: NDArray[np.float64],
+    values: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    columns: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Values (P, C), with weights (P,), known at places (P, 2), rows and columns, at each pair of
+    other rows and columns, (R, S, C): of planes through what is known around, and 0 far from all.
+    """
+    nodes = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
+    away = places - nodes[:, :, np.newaxis]
+    weight = weights * np.exp(-(away**2).sum(axis=-1) / (2 * _NEXT_WINDOWS**2))
+    terms = np.concatenate([np.ones((*away.shape[:-1], 1)), away], axis=-1)
+    normal = np.einsum("rsp,rspi,rspj->rsij", weight, terms, terms) + np.diag(_AS_COMMON)
+    right = np.einsum("rsp,rspi,pc->rsic", weight, terms, values)
+    return np.asarray(np.linalg.solve(normal, right)[:, :, 0])
 
 
 def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:

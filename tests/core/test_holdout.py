@@ -230,12 +230,13 @@ def test_bright_clothes_in_the_grounds_colour_make_no_shade_of_the_ground() -> N
     assert np.mean(held) > 0.95
 
 
-def test_near_a_lamp_shadow_is_deeper_and_still_no_figure() -> None:
-    """A ratio that goes from 0.16 on the left to 0.35: no one ratio is the scene's."""
+@pytest.mark.parametrize(("least", "most"), [(0.16, 0.35), (0.1, 0.4), (0.06, 0.4)])
+def test_near_a_lamp_shadow_is_deeper_and_still_no_figure(least: float, most: float) -> None:
+    """A ratio that changes from left to right: no one ratio is the scene's, or a window's."""
     rng = np.random.default_rng(2)
     texture = cv2.GaussianBlur(rng.normal(size=(HEIGHT, WIDTH)), (0, 0), 1)
     lit = 0.4 * np.exp(0.08 / texture.std() * texture)[..., None] * np.array([1.05, 1.0, 0.9])
-    ratio = (0.16 * (0.35 / 0.16) ** (COLUMNS / WIDTH))[..., None]
+    ratio = (least * (most / least) ** (COLUMNS / WIDTH))[..., None]
     frames, betas, alphas = [], [], []
     for number in range(FRAMES):
         x = steadily(number)
@@ -251,7 +252,7 @@ def test_near_a_lamp_shadow_is_deeper_and_still_no_figure() -> None:
         mask = figure_mask(frame, background)
         shade.append(mask[(beta < 0.05) & (ROWS > 110)].mean())
         figure.append(mask[alpha > 0.5].mean())
-    assert np.mean(shade) < 0.05
+    assert np.mean(shade) < 0.03
     assert np.mean(figure) > 0.95
 
 

@@ -34,6 +34,9 @@ _DEEPEST, _LIGHTEST, _CLEAR, _BLACK = 5.0, -0.25, 8.0, 2.0
 # Of so many ratios that are frequent, each with what differs from it by this logarithm, and none
 # nearer to another than so many bins.
 _FREQUENT, _ALIKE, _BINS = 4, 0.1, 8
+# Of two that are of one colour, so exactly, the deeper is the shadow, the other its penumbra, if
+# more than half as much speaks for it.
+_ONE_RAY, _DEEPER = 0.015, 0.5
 # So many samples at least tell a ratio.
 _TELLING = 20
 # Ratios of shadow scatter by no more than noise and this part; and noise that widens a peak lowers
@@ -224,6 +227,12 @@ class _Frequent(NamedTuple):
     samples: float
     follows: float
 
+    @property
+    def ray(self) -> Float32:
+        """The colour of the light that is missing, which adds up to 1; a penumbra's is the same."""
+        missing = 1 - self.ratio
+        return np.asarray(missing / missing.sum(), np.float32)
+
 
 def _common_ratio(
     stack: Float32, ascending: Index, noise: NoiseModel, size: tuple[int, int]
@@ -245,7 +254,10 @@ def _common_ratio(
     compared = _Compared(stack, bright, difference, logarithm, textures, size)
     common = _most_frequent(compared, noise)
     black = difference <= -_DEEPEST
-    if black.sum() > max(_BLACK * (0 if common is None else common.samples), _TELLING):
+    # Of what is black penumbrae take from all channels alike.
+    penumbra = common is not None and bool(np.abs(common.ray - np.float32(1 / 3)).max() < _ONE_RAY)
+    least = (_DEEPER if penumbra else _BLACK) * (0 if common is None else common.samples)
+    if black.sum() > max(least, _TELLING):
         _, ratios = _ratios(stack, bright, black)
         ratio = np.clip(np.median(ratios, axis=0), 0, _LIGHTEST_RATIO)
         return np.repeat(ratio[:, np.newaxis], light.size, axis=1)
@@ -334,14 +346,16 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
     """
     difference = compared.difference
     # Beyond what is looked for, too: it is next to some of that.
-    counts, edges = np.histogram(difference, bins=210, range=(-_DEEPEST, 0.25))
+    counts, edges = np.histogram(difference, bins=230, range=(-_DEEPEST, 0.75))
+    counts = _without_lit(counts, int(np.searchsorted(edges, 0)))
     excess = _smoothed(counts, 11) - _smoothed(counts, 45)
     excess[(counts == 0) | (edges[1:] >= _LIGHTEST)] = -np.inf
-    best: _Frequent | None = None
+    found: list[_Frequent] = []
     for _ in range(_FREQUENT):
         peak = int(np.argmax(excess))
-        # Nothing that is no more frequent than this can be worth more.
-        if excess[peak] * _LOWERED <= (0 if best is None else best.weight):
+        # Nothing that is no more frequent than this can be worth enough.
+        most = max((other.weight for other in found), default=0.0)
+        if excess[peak] * _LOWERED <= _DEEPER * most:
             break
         away = np.abs(difference - (edges[peak] + edges[peak + 1]) / 2)
         alike = away < _ALIKE
@@ -350,10 +364,31 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
             lowered = min(float(np.hypot(1, noisy / _ALIKE)), _LOWERED)
             certain, possible = _follows(compared, away < _AROUND)
             weight = excess[peak] * lowered * pure * possible**2
-            if weight > (0 if best is None else best.weight):
-                best = _Frequent(ratio, weight, float(alike.sum()) * pure, certain)
+            found.append(_Frequent(ratio, weight, float(alike.sum()) * pure, certain))
         excess[max(peak - _BINS, 0) : peak + _BINS + 1] = -np.inf
-    return best
+    if not found:
+        return None
+    best = max(found, key=lambda other: other.weight)
+    # In the colour of its penumbra, which may be the more frequent.
+    umbrae = [
+        other
+        for other in found
+        if other.weight > _DEEPER * best.weight and np.abs(other.ray - best.ray).max() < _ONE_RAY
+    ]
+    return min(umbrae, key=lambda other: float(other.ratio.sum()))
+
+
+def _without_lit(counts: NDArray[np.integer], zero: int) -> NDArray[np.integer]:
+    """A histogram of differences from light without those of what is lit: noise makes as much of it
+    darker by so much as brighter."""
+    reach = len(counts) - zero
+    lit = zero - reach // 2 + int(np.argmax(counts[zero - reach // 2 : zero + reach // 2]))
+    above = counts[lit + 1 :]
+    rest = counts.copy()
+    below = rest[lit - len(above) : lit]
+    below -= np.minimum(below, above[::-1])
+    rest[lit:] = 0
+    return rest
 
 
 def _usually_bright(stack: Float32, total: Float32, ascending: Index) -> Float32:
@@ -496,7 +531,7 @@ def _mean_where(stack: Float32, chosen: list[Bool]) -> tuple[Float32, Float32]:
 
 
 def _under_a_card(stack: Float32, on_line: list[Bool], lit: Float32) -> bool:
-    """Whether a shadow came over much of the picture, twice at least, and over much of it at once.
+    """Whether a shadow came over much of the picture, and over much of it at once.
 
     What is dark may be clothes, and is shadow for certain where the common ratio says so, but not
     all of a scene has the same: both count. A surface that has another ratio is darkened to the
@@ -528,7 +563,9 @@ def _under_a_card(stack: Float32, on_line: list[Bool], lit: Float32) -> bool:
     both = (others > 0) & (shaded > 0)
     somebody = float(differs.mean() + both.mean() / 2) / max(altogether[0], 1e-6)
     somebody += _COUNTED * brighter
-    large = math.prod((*altogether, *widest)) ** 0.25
+    # A small card may come to each place but once.
+    passed = [float((often >= 1).mean()) for often in (dark, shaded)]
+    large = math.prod((*passed, *widest)) ** 0.25
     return bool(large > _LARGE + _SOMEBODY * somebody)
 
 

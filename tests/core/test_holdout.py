@@ -256,6 +256,44 @@ def test_near_a_lamp_shadow_is_deeper_and_still_no_figure(least: float, most: fl
     assert np.mean(figure) > 0.95
 
 
+@pytest.mark.parametrize("sky", [0.6, 0.7])
+def test_shadow_hardly_darker_than_light_has_its_ratio_too(sky: float) -> None:
+    """Noise spreads what is lit nearly as far as shadow lies below it."""
+    ratio = np.array([sky - 0.02, sky, sky + 0.05])
+    noise = NoiseModel(np.full(3, 1.5e-3), np.full(3, 1e-6))
+    rng = np.random.default_rng(5)
+    frames = []
+    for number in range(SAMPLES):
+        x = steadily(number * FRAMES / SAMPLES)
+        image = SCENE.lit * (ratio + shadow_beta(x)[..., None] * (1 - ratio))
+        image += figure_alpha(x)[..., None] * (figure_colour(x, DARK) - image)
+        spread = noise.sigma(image.astype(np.float32))
+        frames.append((image + spread * rng.normal(size=image.shape)).astype(np.float32))
+    background = find_background(frames, noise)
+    found = np.median(background.shadow / background.lit, axis=(0, 1))
+    assert found == pytest.approx(ratio, abs=0.05)
+
+
+def test_of_a_shadow_and_its_wide_penumbra_the_shadow_counts() -> None:
+    """More of the ground is in half light, as beside two lamps, than in shadow."""
+    frames, betas, alphas = [], [], []
+    for number in range(FRAMES):
+        x = steadily(number)
+        half = np.where((ROWS > 88) & (np.abs(COLUMNS - x - 30) < 18), 0.5, 1.0)
+        betas.append(np.minimum(half, shadow_beta(x)))
+        alphas.append(figure_alpha(x))
+        image = SCENE.image(betas[-1].astype(np.float32))
+        image += alphas[-1][..., None] * (figure_colour(x, MANY) - image)
+        frames.append(SCENE.noisy(image.astype(np.float32), number))
+    chosen = np.linspace(0, FRAMES - 1, SAMPLES).round().astype(int)
+    background = find_background([frames[i] for i in chosen], NOISE)
+    shade = [
+        figure_mask(frame, background)[(beta < 0.05) & (ROWS > 100)].mean()
+        for frame, beta in zip(frames, betas, strict=True)
+    ]
+    assert np.mean(shade) < 0.1
+
+
 def test_a_surface_that_shade_makes_darker_than_others_is_background_too() -> None:
     wall = (COLUMNS > 100) & (COLUMNS < 160) & (ROWS > 95)
     grain = 0.7 * np.exp(0.4 * np.random.default_rng(0).normal(size=wall.shape))[..., None]
@@ -356,6 +394,19 @@ def test_what_covers_half_of_a_picture_is_a_card_if_nobody_is_seen(somebody: boo
         image = SCENE.image(beta.astype(np.float32))
         alpha = figure_alpha(x)[..., None] * somebody
         frames.append(SCENE.noisy(alpha * figure_colour(x, MANY) + (1 - alpha) * image, number))
+    assert find_background(frames, NOISE).under_card != somebody
+
+
+@pytest.mark.parametrize("somebody", [False, True])
+def test_a_card_may_come_to_each_place_but_once(somebody: bool) -> None:
+    frames = []
+    for number in range(SAMPLES):
+        x, y = 30 + 60 * (number % 4), 12 + 19 * (number // 4)
+        beta = np.where((np.abs(COLUMNS - x) < 28) & (np.abs(ROWS - y) < 10), 0.0, 1.0)
+        image = SCENE.image(beta.astype(np.float32))
+        alpha = figure_alpha(steadily(number))[..., None] * somebody
+        colour = figure_colour(steadily(number), MANY)
+        frames.append(SCENE.noisy(alpha * colour + (1 - alpha) * image, number))
     assert find_background(frames, NOISE).under_card != somebody
 
 

@@ -68,7 +68,7 @@ _CLUSTER, _ROUNDS, _LIGHTEST_RATIO = 2.5, 3, 0.9
 _WINDOWS, _LEAST_WINDOW, _CERTAIN, _FURTHEST, _COLOURED = (4, 6), 20, 0.15, 1.2, 0.25
 # Between them ratios lie on planes through those that are so many windows away, a standard
 # deviation. That there is the common one, and no slope down or across, counts as so much of one.
-_NEXT_WINDOWS, _AS_COMMON = 0.8, (0.05, 0.3, 0.3)
+_NEXT_WINDOWS, _AS_COMMON = 1.0, (0.05, 0.3, 0.3)
 # Where their logarithms differ by more than the first, they are looked for again, so many times in
 # all.
 _EVEN, _LOOKS = 0.15, 3

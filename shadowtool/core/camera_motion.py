@@ -33,6 +33,8 @@ _SMALLER, _STEPS, _ARRIVED = (4, 2, 1), 5, 0.002
 _OUT, _ONE_WAY = 4.7, 0.01
 # The standard error of a median, times the square root of their number, in median deviations.
 _MEDIAN_ERROR = 1.48 * 1.25
+# Fewer than this part of the tiles may all be what moves in front of the camera.
+_FEWEST = 1 / 4
 # A camera moves so many of the tiles alike, give or take this, pixels, or this part of it: what
 # moves fewer of them moved in front of it.
 _CAMERA, _TOGETHER, _PART = 2 / 3, 0.15, 0.5
@@ -109,7 +111,7 @@ def _displacement(reference: Float32, other: Float32) -> _Displacement | None:
                 break
         if smaller > 1 and len(agreed) < len(others):
             place = np.zeros(2)
-    if not len(agreed):
+    if len(agreed) < max(_FEWEST * (len(agreed) + len(others)), 1):
         return None
     off = np.abs(agreed - np.median(agreed, axis=0))
     together = max(_TOGETHER, _PART * float(np.abs(place).max()))

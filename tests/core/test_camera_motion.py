@@ -54,6 +54,15 @@ def test_next_to_no_texture_tells_nothing() -> None:
     assert Vantage.of(faint).off(dragged) == (0.0, 0.0)
 
 
+def test_what_moves_in_a_corner_of_a_plain_picture_is_not_the_camera() -> None:
+    corner = (slice(4, 78), slice(4, 78))
+    plain = [0.5 * np.exp(0.18 * (ground(seed) - 0.5)).astype(np.float32) for seed in (1, 2)]
+    plain[0][corner] *= np.exp(ground(3))[corner]
+    plain[1][corner] *= np.exp(moved(ground(3), 0.6, 0.0))[corner]
+    assert shift(prepare(plain[0]), prepare(plain[1]), 320) is None
+    assert Vantage.of(plain[0]).off(plain[1]) == (0.0, 0.0)
+
+
 def test_grain_that_shows_one_direction_only_is_no_movement() -> None:
     rng = np.random.default_rng(3)
     rows = np.repeat(rng.uniform(0.2, 0.6, (120, 1)), 200, axis=1)

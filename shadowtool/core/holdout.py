@@ -364,7 +364,8 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
             lowered = min(float(np.hypot(1, noisy / _ALIKE)), _LOWERED)
             certain, possible = _follows(compared, away < _AROUND)
             weight = excess[peak] * lowered * pure * possible**2
-            found.append(_Frequent(ratio, weight, float(alike.sum()) * pure, certain))
+            if weight > 0:
+                found.append(_Frequent(ratio, weight, float(alike.sum()) * pure, certain))
         excess[max(peak - _BINS, 0) : peak + _BINS + 1] = -np.inf
     if not found:
         return None
@@ -380,10 +381,10 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
 
 def _without_lit(counts: NDArray[np.integer], zero: int) -> NDArray[np.integer]:
     """A histogram of differences from light without those of what is lit: noise makes as much of it
-    darker by so much as brighter."""
+    darker by so much as brighter, and the less the further."""
     reach = len(counts) - zero
     lit = zero - reach // 2 + int(np.argmax(counts[zero - reach // 2 : zero + reach // 2]))
-    above = counts[lit + 1 :]
+    above = np.minimum.accumulate(counts[lit + 1 :])
     rest = counts.copy()
     below = rest[lit - len(above) : lit]
     below -= np.minimum(below, above[::-1])

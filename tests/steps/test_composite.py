@@ -82,7 +82,9 @@ def test_beta_may_come_with_an_alpha(tmp_path: Path) -> None:
     folder.mkdir()
     rgba = np.repeat(BETA[..., np.newaxis], 4, axis=-1)
     rgba[..., 3] = 1
-    write_exr(folder / "beta.1001.exr", {"RGBA": rgba}, HEADER)
+    # Other programs keep what was written into a file of ours.
+    ours = {"command": "shadowtool matte frames=a --plates=b"}
+    write_exr(folder / "beta.1001.exr", {"RGBA": rgba}, HEADER, ours)
     mattes, plates = tmp_path / "plain" / "matte", tmp_path / "plain" / "plates"
     composite(mattes, tmp_path / ".out", plates=plates, beta=folder)
     # A name that begins with a dot would hide the frames.

@@ -34,6 +34,8 @@ _DEEPEST, _LIGHTEST, _CLEAR, _BLACK = 5.0, -0.25, 8.0, 2.0
 # Of so many ratios that are frequent, each with what differs from it by this logarithm, and none
 # nearer to another than so many bins.
 _FREQUENT, _ALIKE, _BINS = 4, 0.1, 8
+# What is lit has no ratio lower than by so many bins.
+_LIT_BINS = 15
 # Of two that are of one colour, so exactly, the deeper is the shadow, the other its penumbra, if
 # more than half as much speaks for it.
 _ONE_RAY, _DEEPER = 0.015, 0.5
@@ -63,8 +65,8 @@ _TEXTURE_RANKS, _AROUND, _LEAST_LIKELY = (0.8, 0.95), 0.3, 0.05
 _CLUSTER, _ROUNDS, _LIGHTEST_RATIO = 2.5, 3, 0.9
 # So many windows down and across, of so many points down and across at least, may have ratios of
 # their own, if they have more than the first part of the ground's texture for certain, and differ
-# by no more than the second, a logarithm, and in no channel from the others by more than the third
-# for what they differ by and 1: the light that is missing is of one colour.
+# by no more than the second, a logarithm, in one look, and in no channel from the others by more
+# than the third for what they differ by and 1: the light that is missing is of one colour.
 _WINDOWS, _LEAST_WINDOW, _CERTAIN, _FURTHEST, _COLOURED = (4, 6), 20, 0.15, 1.2, 0.25
 # Between them ratios lie on planes through those that are so many windows away, a standard
 # deviation. That there is the common one, and no slope down or across, counts as so much of one.
@@ -346,7 +348,7 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
     """
     difference = compared.difference
     # Beyond what is looked for, too: it is next to some of that.
-    counts, edges = np.histogram(difference, bins=230, range=(-_DEEPEST, 0.75))
+    counts, edges = np.histogram(difference, bins=260, range=(-_DEEPEST, 1.5))
     counts = _without_lit(counts, int(np.searchsorted(edges, 0)))
     excess = _smoothed(counts, 11) - _smoothed(counts, 45)
     excess[(counts == 0) | (edges[1:] >= _LIGHTEST)] = -np.inf
@@ -382,8 +384,9 @@ def _most_frequent(compared: _Compared, noise: NoiseModel) -> _Frequent | None:
 def _without_lit(counts: NDArray[np.integer], zero: int) -> NDArray[np.integer]:
     """A histogram of differences from light without those of what is lit: noise makes as much of it
     darker by so much as brighter, and the less the further."""
-    reach = len(counts) - zero
-    lit = zero - reach // 2 + int(np.argmax(counts[zero - reach // 2 : zero + reach // 2]))
+    # Where the light that it is beside was dimmed, what is lit is above 0.
+    first = zero - _LIT_BINS
+    lit = first + int(np.argmax(counts[first:]))
     above = np.minimum.accumulate(counts[lit + 1 :])
     rest = counts.copy()
     below = rest[lit - len(above) : lit]

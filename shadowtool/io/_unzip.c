@@ -124,8 +124,13 @@ static PyObject *py_unzip(PyObject *module, PyObject *arguments)
     uint8_t *scratch = NULL;
     if (!PyErr_Occurred() && (layout.rows < 1 || layout.length < 1))
         PyErr_SetString(PyExc_ValueError, "chunks without rows, or rows without bytes");
-    if (!PyErr_Occurred() && !(scratch = malloc((size_t)(layout.rows * layout.length))))
-        PyErr_NoMemory();
+    if (!PyErr_Occurred()) {
+        Py_ssize_t size = layout.rows * layout.length;
+        /* One byte more, as of nothing there may be no memory. */
+        scratch = malloc((size_t)(size < target.len ? size : target.len) + 1);
+        if (!scratch)
+            PyErr_NoMemory();
+    }
     if (!PyErr_Occurred()) {
         Py_BEGIN_ALLOW_THREADS
         done = unzip(inflate, &data, &table, &target, &layout, scratch);

@@ -8,6 +8,7 @@ import os
 import threading
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -73,19 +74,34 @@ def fingerprinted(paths: Sequence[Path]) -> Iterator[list[str]]:
         _known.files = before
 
 
-class File(NamedTuple):
+class File:
     """A file that is being read.
 
-    Attributes:
-        data: its content.
-        source: what a library is to decode: the file's name, since by itself it reads fastest;
-            the content where the name is in no encoding.
-        fingerprint: see `fingerprint`.
+    Raises:
+        InputError, RetryError: as `read_bytes`, in whatever reads it.
     """
 
-    data: bytes
-    source: str | BinaryIO
-    fingerprint: str
+    def __init__(self, path: Path, mark: str | None) -> None:
+        self._path, self._mark = path, mark
+
+    @cached_property
+    def content(self) -> bytes:
+        """All of it."""
+        return read_bytes(self._path)
+
+    @cached_property
+    def source(self) -> str | BinaryIO:
+        """What a library is to decode: the file's name, since by itself it reads fastest; the
+        content where the name is in no encoding."""
+        name = os.fspath(self._path)
+        return name if _is_text(name) else io.BytesIO(self.content)
+
+    def fingerprint(self) -> str:
+        """See `fingerprint`; of the content, if that was read."""
+        if self._mark is None:
+            read = "content" in self.__dict__
+            self._mark = fingerprint(self.content) if read else fingerprint_file(self._path)
+        return self._mark
 
 
 @contextlib.contextmanager
@@ -93,14 +109,16 @@ def unchanging(path: Path) -> Iterator[File]:
     """A file, for a library to decode or for the caller.
 
     Raises:
-        InputError, RetryError: as `read_bytes`; RetryError also if the file changed meanwhile.
+        InputError, RetryError: as `read_bytes`; RetryError also if the file changed meanwhile,
+            whatever came of it.
     """
-    known = _known.files.get(path)
-    version = known[0] if known else _version(path)
-    data = read_bytes(path)
-    name = os.fspath(path)
-    source = name if _is_text(name) else io.BytesIO(data)
-    yield File(data, source, known[1] if known else fingerprint(data))
+    version, mark = _known.files.get(path) or (_version(path), None)
+    try:
+        yield File(path, mark)
+    except ShadowtoolError:
+        if _version(path) != version:
+            raise _changed(path) from None
+        raise
     if _version(path) != version:
         raise _changed(path)
 

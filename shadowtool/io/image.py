@@ -50,6 +50,8 @@ _ATTRIBUTE = "shadowtool."
 _COLOURED = 1 / 32
 # ZIP levels: the library's own, and the least that compresses.
 _USUAL, _QUICK = -1, 1
+# Compressions whose scanlines `scanlines` decodes.
+_IN_ORDER = (OpenEXR.NO_COMPRESSION, OpenEXR.ZIPS_COMPRESSION, OpenEXR.ZIP_COMPRESSION)
 # What OpenEXR raises for headers that make no sense; ZeroDivisionError is a rational number's.
 _EXR_FAULTS = (RuntimeError, ValueError, TypeError, ArithmeticError)
 
@@ -516,7 +518,12 @@ def _decode_exr(path: Path, file: File, apart: bool) -> Image:
     listed = _open_exr(path, file.source, header_only=True)
     header = _exr_header(path, listed)
     raw = listed.header(0)
-    channels = scanlines.decode(file.data, apart) or _channels(path, file.source, listed, apart)
+    channels: Mapping[str, NDArray[Any] | None] | None = None
+    # What is left to OpenEXR need not be in memory.
+    if len(listed.parts) == 1 and raw.get("compression") in _IN_ORDER:
+        channels = scanlines.decode(file.content, apart)
+    if channels is None:
+        channels = _channels(path, file.source, listed, apart)
     first, last = _window(path, raw, "dataWindow")
     layers = {}
     for name, values in channels.items():
@@ -528,7 +535,7 @@ def _decode_exr(path: Path, file: File, apart: bool) -> Image:
     if not apart and set("RGB") <= layers.keys():
         names = [name for name in "RGBA" if name in layers]
         layers["".join(names)] = _joined([layers.pop(name) for name in names])
-    return Image(path, header, layers, file.fingerprint)
+    return Image(path, header, layers, file.fingerprint())
 
 
 def _channels(

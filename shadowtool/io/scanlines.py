@@ -111,7 +111,7 @@ def decode(data: bytes, apart: bool = False) -> dict[str, NDArray[Any]] | None:
     version = int.from_bytes(data[4:8], "little")
     if data[:4] != _MAGIC or version & ~_LONG_NAMES != _VERSION:
         return None
-    with contextlib.suppress(struct.error, ValueError, LookupError):
+    with contextlib.suppress(struct.error, ValueError, LookupError, MemoryError):
         layout = _layout(data)
         chunks = _Chunks(data, layout, inflate if layout.packed else 0)
         colour = layout.colour()
@@ -157,15 +157,20 @@ def _channels(listed: bytes, width: int) -> tuple[dict[str, _Place], int]:
     """Channels as they follow each other in a row, and the bytes of a row.
 
     Raises:
-        ValueError: a channel is subsampled, or of those that OpenEXR joins.
+        ValueError: a channel is subsampled, or of those that OpenEXR joins, or they are not in the
+            order of their names, by which OpenEXR goes.
     """
     channels: dict[str, _Place] = {}
     at = length = 0
+    before = b""
     while listed[at]:
         end = listed.index(0, at)
+        if listed[at:end] <= before:
+            raise ValueError("channels are out of order")
+        before = listed[at:end]
         name = listed[at:end].decode()
         kind, *sampling = struct.unpack_from("<I4xii", listed, end + 1)
-        if sampling != [1, 1] or "." in name or name in _JOINED or name in channels:
+        if sampling != [1, 1] or "." in name or name in _JOINED:
             raise ValueError(f"channel {name}")
         channels[name] = _Place(length, _TYPES[kind])
         length += width * _TYPES[kind].itemsize

@@ -188,9 +188,7 @@ def _places(warp: Path, header: Header, of: str) -> tuple[Float32, str]:
 def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:
     """β of a frame, (H, W) or (H, W, 3), and how many of its pixels are unknown."""
     image = read_image(sequence.path(frame))
-    # Other programs keep what we wrote into a file, and add an opaque alpha.
-    figure = "RGBA" in image.layers and made_by(image.header, "matte")
-    if figure and not (image.channel("A") >= 1).all():
+    if "RGBA" in image.layers and made_by(image.header, "matte") and _is_figure(image):
         raise InputError(
             f"{image.path}: is the figure that matte wrote, no β; give the frames in {BETA_FOLDER}/"
         )
@@ -206,6 +204,13 @@ def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, 
         elif fill == "inpaint":
             values = np.dstack([inpaint(values[..., c]) for c in range(3)])
     return values, int(holes.any(axis=-1).sum() if holes.ndim == 3 else holes.sum())
+
+
+def _is_figure(image: Image) -> bool:
+    """Whether a picture with alpha is premultiplied: β that another program gave an alpha, of
+    whatever kind, is light where that is 0."""
+    colour, outside = image.rgb("none"), image.channel("A") <= 0
+    return bool(outside.any()) and not colour[outside].any()
 
 
 def _figure_box(image: Image) -> Box:

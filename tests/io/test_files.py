@@ -305,7 +305,8 @@ def test_a_file_is_read_once_or_decoded_by_its_name(tmp_path):
     path = tmp_path / "a file"
     path.write_bytes(b"first")
     with unchanging(path) as file:
-        assert file == (b"first", str(path), fingerprint(b"first"))
+        assert (file.source, file.fingerprint()) == (str(path), fingerprint(b"first"))
+        assert (file.content, file.fingerprint()) == (b"first", fingerprint(b"first"))
 
 
 @pytest.mark.parametrize("replaced", [True, False])
@@ -322,6 +323,14 @@ def test_a_file_that_changes_while_it_is_decoded_is_worth_a_retry(replaced, tmp_
             path.write_bytes(b"more than that")
 
 
+def test_what_is_wrong_with_a_file_that_changed_is_that(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"first")
+    with pytest.raises(RetryError, match="a: changed while it was read"), unchanging(path):
+        path.write_bytes(b"more than that")
+        raise InputError("of another size")
+
+
 def test_a_file_that_goes_while_it_is_decoded_is_named(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"first")
@@ -336,7 +345,7 @@ def test_a_file_that_changed_since_its_fingerprint_was_given_is_an_error(tmp_pat
     with fingerprinted([path, other, path]) as marks:
         assert marks == [fingerprint(b"first"), fingerprint(b"other"), fingerprint(b"first")]
         with unchanging(other) as file:
-            assert file == (b"other", str(other), marks[1])
+            assert (file.source, file.fingerprint()) == (str(other), marks[1])
         path.write_bytes(b"second")
         with pytest.raises(RetryError, match="a: changed while it was read"), unchanging(path):
             pass
@@ -350,7 +359,7 @@ def test_a_name_in_no_encoding_is_decoded_from_memory(tmp_path):
     path = tmp_path / os.fsdecode(b"\xff.exr")
     path.write_bytes(b"first")
     with unchanging(path) as file:
-        assert (file.source.read(9), file.fingerprint) == (b"first", fingerprint(b"first"))
+        assert (file.source.read(9), file.fingerprint()) == (b"first", fingerprint(b"first"))
 
 
 def test_a_fault_of_the_machine_while_reading_is_worth_a_retry(tmp_path, monkeypatch):
@@ -368,8 +377,10 @@ def test_a_fault_of_the_machine_while_reading_is_worth_a_retry(tmp_path, monkeyp
     monkeypatch.setattr(Path, "read_bytes", failing)
     with pytest.raises(RetryError, match="a: cannot read"):
         fingerprint_file(path)
-    with pytest.raises(RetryError, match="a: cannot read"), unchanging(path):
-        pass
+    with pytest.raises(RetryError, match="a: cannot read"), unchanging(path) as file:
+        file.fingerprint()
+    with pytest.raises(RetryError, match="a: cannot read"), unchanging(path) as file:
+        assert file.content
 
 
 def test_the_fingerprint_of_a_missing_file_is_an_error(tmp_path):

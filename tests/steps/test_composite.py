@@ -76,12 +76,13 @@ def test_a_figure_of_code_values_is_found_too(tmp_path: Path) -> None:
     assert put(tmp_path, codes, ".png") == pytest.approx(expected(white), abs=1e-3)
 
 
-def test_beta_may_come_with_an_alpha(tmp_path: Path) -> None:
+@pytest.mark.parametrize("alpha", [0, 0.5, 1])
+def test_beta_may_come_with_an_alpha(tmp_path: Path, alpha: float) -> None:
     plain = put(tmp_path / "plain", spots())
     folder = tmp_path / "nuke"
     folder.mkdir()
     rgba = np.repeat(BETA[..., np.newaxis], 4, axis=-1)
-    rgba[..., 3] = 1
+    rgba[..., 3] = alpha
     # Other programs keep what was written into a file of ours.
     ours = {"command": "shadowtool matte frames=a --plates=b"}
     write_exr(folder / "beta.1001.exr", {"RGBA": rgba}, HEADER, ours)

@@ -34,8 +34,8 @@ _DEEPEST, _LIGHTEST, _CLEAR, _BLACK = 5.0, -0.25, 8.0, 2.0
 # Of so many ratios that are frequent, each with what differs from it by this logarithm, and none
 # nearer to another than so many bins.
 _FREQUENT, _ALIKE, _BINS = 4, 0.1, 8
-# What is lit has no ratio lower than by so many bins.
-_LIT_BINS = 15
+# What is lit is most frequent no lower than so many bins below light, and spreads to so many.
+_LIT_BINS, _LIT_SPREAD = 15, 30
 # Of two that are of one colour, so exactly, the deeper is the shadow, the other its penumbra, if
 # more than half as much speaks for it.
 _ONE_RAY, _DEEPER = 0.015, 0.5
@@ -387,7 +387,7 @@ def _without_lit(counts: NDArray[np.integer], zero: int) -> NDArray[np.integer]:
     # Where the light that it is beside was dimmed, what is lit is above 0.
     first = zero - _LIT_BINS
     lit = first + int(np.argmax(counts[first:]))
-    above = np.minimum.accumulate(counts[lit + 1 :])
+    above = np.minimum.accumulate(counts[lit + 1 : lit + 1 + _LIT_SPREAD])
     rest = counts.copy()
     below = rest[lit - len(above) : lit]
     below -= np.minimum(below, above[::-1])

@@ -274,12 +274,13 @@ def _with_windows(compared: _Compared, common: Float32, noise: NoiseModel) -> Fl
     Where it differs much, so that it isn't one in a window either, it is looked for again in what
     it would be without that.
     """
-    shift = np.zeros(compared.bright.shape, np.float32)
+    shift, beside = np.zeros(compared.bright.shape, np.float32), compared
     for _ in range(_LOOKS):
-        further = _window_shifts(compared.dimmed(shift), common, noise)
+        further = _window_shifts(beside, common, noise)
         shift += further
         if np.ptp(further) < _EVEN:
             break
+        beside = compared.dimmed(shift)
     ratio = common[:, np.newaxis] * np.exp(shift)
     return np.ascontiguousarray(np.clip(ratio, 0, _LIGHTEST_RATIO), np.float32)
 

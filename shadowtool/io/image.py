@@ -50,8 +50,6 @@ _ATTRIBUTE = "shadowtool."
 _COLOURED = 1 / 32
 # ZIP levels: the library's own, and the least that compresses.
 _USUAL, _QUICK = -1, 1
-# Compressions whose scanlines `scanlines` decodes.
-_IN_ORDER = (OpenEXR.NO_COMPRESSION, OpenEXR.ZIPS_COMPRESSION, OpenEXR.ZIP_COMPRESSION)
 # What OpenEXR raises for headers that make no sense; ZeroDivisionError is a rational number's.
 _EXR_FAULTS = (RuntimeError, ValueError, TypeError, ArithmeticError)
 
@@ -520,7 +518,7 @@ def _decode_exr(path: Path, file: File, apart: bool) -> Image:
     raw = listed.header(0)
     channels: Mapping[str, NDArray[Any] | None] | None = None
     # What is left to OpenEXR need not be in memory.
-    if len(listed.parts) == 1 and raw.get("compression") in _IN_ORDER:
+    if len(listed.parts) == 1 and scanlines.decodes(int(raw["compression"])):
         channels = scanlines.decode(file.content, apart)
     if channels is None:
         channels = _channels(path, file.source, listed, apart)

@@ -276,9 +276,9 @@ def map_place(path: Path) -> Path:
     return path
 
 
-def made_by(header: Header, step: str) -> bool:
-    """Whether a file says that this step of ours wrote it."""
-    return header.provenance.get("command", "").split()[:2] == ["shadowtool", step]
+def made_by(header: Header) -> str:
+    """The step of ours that wrote a file; nothing if it doesn't say."""
+    return "".join(header.provenance.get("command", "").split()[1:2])
 
 
 def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
@@ -301,9 +301,8 @@ def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
 
 
 def _require_st_map(image: Image, st_map: NDArray[np.float32]) -> None:
-    step = image.header.provenance.get("command", "shadowtool warp").split()[1:2]
-    if step != ["warp"]:
-        raise InputError(f"{image.path}: was made by `shadowtool {''.join(step)}`, is no ST map")
+    if (step := made_by(image.header)) not in ("", "warp"):
+        raise InputError(f"{image.path}: was made by `shadowtool {step}`, is no ST map")
     if image.header.bits == 8:
         raise InputError(f"{image.path}: 8 bits can't tell pixels apart; give an ST map in EXR")
     if any(values.dtype == np.float16 for values in image.layers.values()):

@@ -92,6 +92,16 @@ class _Layout:
         return values.view(kind)
 
 
+def decodes(compression: int) -> bool:
+    """Whether scanlines of this compression, by OpenEXR's number, are decoded here at all."""
+    return bytes([compression]) in _ROWS and _inflate() is not None
+
+
+def _inflate() -> int | None:
+    """The address of what inflates; None where that, or what goes with it, is missing."""
+    return None if _unzip is None or sys.byteorder != "little" else inflating()
+
+
 def decode(data: bytes, apart: bool = False) -> dict[str, NDArray[Any]] | None:
     """Channels by name, of the data window's size; float16, float32 or uint32.
 
@@ -105,11 +115,9 @@ def decode(data: bytes, apart: bool = False) -> dict[str, NDArray[Any]] | None:
         (H, W, C) under these letters. None for a file that isn't whole, or isn't of one part in
         scanlines, uncompressed or ZIP, with all channels at full size.
     """
-    inflate = inflating()
-    if _unzip is None or inflate is None or sys.byteorder != "little":
-        return None
+    inflate = _inflate()
     version = int.from_bytes(data[4:8], "little")
-    if data[:4] != _MAGIC or version & ~_LONG_NAMES != _VERSION:
+    if inflate is None or data[:4] != _MAGIC or version & ~_LONG_NAMES != _VERSION:
         return None
     with contextlib.suppress(struct.error, ValueError, LookupError, MemoryError):
         layout = _layout(data)

@@ -188,7 +188,7 @@ def _places(warp: Path, header: Header, of: str) -> tuple[Float32, str]:
 def _visibility(sequence: Sequence, frame: Frame, fill: Fill) -> tuple[Float32, int]:
     """β of a frame, (H, W) or (H, W, 3), and how many of its pixels are unknown."""
     image = read_image(sequence.path(frame))
-    if "RGBA" in image.layers and made_by(image.header, "matte") and _is_figure(image):
+    if "RGBA" in image.layers and made_by(image.header) == "matte" and _is_figure(image):
         raise InputError(
             f"{image.path}: is the figure that matte wrote, no β; give the frames in {BETA_FOLDER}/"
         )

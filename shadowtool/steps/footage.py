@@ -21,6 +21,7 @@ from shadowtool.core.noise import (
 from shadowtool.core.trembling import UNSTEADY, strips
 from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
+from shadowtool.io.products import made_by
 from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
 
@@ -29,7 +30,7 @@ logger = logging.getLogger(__name__)
 Float32 = NDArray[np.float32]
 
 # Steps whose mattes lie where the plates see the scene from.
-_IN_PLACE = ("shadowtool plate ", "shadowtool matte ")
+_IN_PLACE = ("plate", "matte")
 
 
 class Survey(NamedTuple):
@@ -155,8 +156,7 @@ def moved_with(values: NDArray[np.floating], header: Header, place: Place) -> ND
         header: of the matte's file.
         place: as of `Footage.off`.
     """
-    command = header.provenance.get("command", "")
-    return values if command.startswith(_IN_PLACE) else displaced(values, place)
+    return values if made_by(header) in _IN_PLACE else displaced(values, place)
 
 
 def say_assumed(footage: Footage, transfer: str) -> None:

@@ -376,7 +376,7 @@ class _Take:
     def _figure(self, frame: Frame, shown: _Shown) -> _Figure:
         if self.alpha is not None:
             stored = read_image(self.alpha.path(frame))
-            if "confidence" in stored.layers and made_by(stored.header, "matte"):
+            if "confidence" in stored.layers and made_by(stored.header) == "matte":
                 raise InputError(
                     f"{stored.path}: is the β that matte wrote, no figure; give the frames in"
                     f" {FIGURE_FOLDER}/"

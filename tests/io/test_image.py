@@ -356,13 +356,31 @@ def test_what_is_no_exr_is_damaged(content, read, tmp_path):
         read(path)
 
 
-def test_a_machine_that_fails_while_a_picture_is_read_is_worth_a_retry(exr, monkeypatch):
+@pytest.mark.parametrize("compression", ["ZIP", "PIZ"])
+@pytest.mark.parametrize("after", [0, 1])
+def test_a_machine_that_fails_while_a_picture_is_decoded_is_worth_a_retry(
+    after, compression, tmp_path, monkeypatch
+):
+    """Whether it is read at once or block by block."""
+    kind = getattr(OpenEXR, f"{compression}_COMPRESSION")
+    raw_exr(tmp_path / "large.exr", {"RGB": random(300, 400, 3)}, compression=kind)
+
+    class Failing(io.FileIO):
+        blocks = 0
+
+        def readinto(self, buffer):
+            self.blocks += 1
+            if self.blocks > after:
+                raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+            return super().readinto(buffer)
+
     def failing(path):
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
 
+    monkeypatch.setattr("io.FileIO", Failing)
     monkeypatch.setattr(Path, "read_bytes", failing)
-    with pytest.raises(RetryError, match=r"frame\.exr: cannot read: Stale"):
-        read_image(exr)
+    with pytest.raises(RetryError, match=r"large\.exr: cannot read: Stale"):
+        read_image(tmp_path / "large.exr")
 
 
 def test_a_png_named_exr_is_damaged(png, tmp_path):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from shadowtool.core.color_line import Weighed, channels, line_distance
 from shadowtool.core.half_floats import to_float
 from shadowtool.core.noise import NoiseModel
+from shadowtool.core.standing import Sampled
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -130,6 +131,7 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     ascending = np.argsort(stack.sum(axis=1), axis=0)
     ratio = _common_ratio(stack, ascending, noise, shape[:2])
     lit = _most_supported(stack, ascending, weighed, ratio)
+    lit = Sampled(stack, weighed, lit, ratio, shape[:2]).uncovered()
     shadow = lit * ratio
     on_line = [_on_line(sample, lit, shadow) for sample in weighed]
     under_card = _under_a_card(stack, on_line, lit)

@@ -42,6 +42,21 @@ def pausing(frame: int) -> float:
     return 25 + 190 * float(np.interp(frame, [0, 13, 27, 39], [0, 0.5, 0.5, 1]))
 
 
+def stopping(frame: int) -> float:
+    """Walks in and stands for 60% of the take."""
+    return 25 + 190 * float(np.interp(frame, [0, 0.4 * FRAMES], [0, 0.5]))
+
+
+def leaving(frame: int) -> float:
+    """Stands for 60% of the take and walks out."""
+    return 215 - 190 * float(np.interp(frame, [0.6 * FRAMES, FRAMES], [0.5, 1]))
+
+
+def waiting(frame: int) -> float:
+    """Stands in the middle for all but a sixth of the take at either end."""
+    return 25 + 190 * float(np.interp(frame, [0, 7, 33, 39], [0, 0.5, 0.5, 1]))
+
+
 def about_the_middle(frame: int) -> float:
     """Stays about the middle of the picture."""
     return 80 + 110 * frame / (FRAMES - 1)
@@ -109,6 +124,10 @@ def shoot(name: str) -> Shoot:
     takes = {
         "walking": lambda: Shoot(steadily),
         "pausing": lambda: Shoot(pausing),
+        "stopping": lambda: Shoot(stopping),
+        "stopping in dark clothes": lambda: Shoot(stopping, DARK),
+        "leaving": lambda: Shoot(leaving),
+        "waiting": lambda: Shoot(waiting),
         "dark clothes": lambda: Shoot(about_the_middle, DARK, shade=middle_shade()),
         "dark clothes right across": lambda: Shoot(steadily, DARK),
         "all but black clothes": lambda: Shoot(steadily, VELVET),
@@ -130,6 +149,10 @@ def middle_shade() -> np.ndarray:
 TAKES = [
     "walking",
     "pausing",
+    "stopping",
+    "stopping in dark clothes",
+    "leaving",
+    "waiting",
     "dark clothes",
     "dark clothes right across",
     "all but black clothes",

@@ -91,7 +91,8 @@ gain_option = click.option(
     default="auto",
     show_default=True,
     help="Light that changes over the take. auto: each frame's exposure is found from the pixels"
-    " that agree, taken out and recorded. none: frames are taken as they are.",
+    " that agree, taken out and recorded; so are, but by scan, its white balance and the bands of a"
+    " lamp that flickers. none: frames are taken as they are.",
 )
 steady_option = click.option(
     "--steady",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from shadowtool.choices import Beta, Fill
 from shadowtool.core.bands import bands, channel_sum, in_all_channels, overlapping_bands
 from shadowtool.core.boxes import Box, around
-from shadowtool.core.exposure import without_gain
+from shadowtool.core.exposure import Gains, is_one, of_rows, without_gain
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.half_floats import to_float, to_half
 from shadowtool.core.noise import NoiseModel, extreme_range
@@ -252,7 +252,7 @@ class Gauge:
         self,
         image: NDArray[np.floating],
         unseen: Bool,
-        gain: float = 1,
+        gain: Gains = 1.0,
         ground: tuple[Box, Float32] | None = None,
         clamp: bool = False,
     ) -> Float32:
@@ -261,7 +261,8 @@ class Gauge:
         Args:
             image: (H, W, 3), linear light.
             unseen: (H, W), where the frame does not show the ground.
-            gain: how much brighter than the plates the frame is.
+            gain: how much brighter than the plates the frame is, or each of its rows and
+                channels.
             ground: rows and columns of a part of the frame, and what is seen of the ground there
                 at gain 1, (h, w, 3).
             clamp: keep β within 0 and 1.
@@ -274,7 +275,9 @@ class Gauge:
         height, width = image.shape[:2]
         step = max(1, _PIXELS // max(width, 1))
         for taken, own in overlapping_bands(height, _WINDOW // 2, step):
-            light = without_gain(to_float(image[taken]), gain) if gain != 1 else image[taken]
+            light = image[taken]
+            if not is_one(gain):
+                light = without_gain(to_float(light), of_rows(gain, taken))
             beta = shadow_matte(light, self.shadow[taken], self.inverse[taken], kind)
             if ground is not None:
                 self._project(beta, taken, *ground)

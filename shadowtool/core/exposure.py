@@ -1,12 +1,19 @@
-"""Light that changes over a take: one gain a frame, found from the pixels that agree."""
+"""Light that changes over a take: a frame's gain, found from the pixels that agree.
+
+It is one number, or one for each row and channel where the light flickers or changes its colour.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands, channel_sum
+from shadowtool.core.flicker import band_gains
 from shadowtool.core.half_floats import rounded, to_float
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+# The gain of a whole picture, or of each row and channel, (H, 3).
+Gains = float | Float64
 
 # Logarithms of gains further from 0 are shadow, not exposure.
 _WIDEST = 0.35
@@ -14,6 +21,9 @@ _WIDEST = 0.35
 _NOTHING = 0.004
 # What moves no time by which a shadow passes.
 _HARMLESS = 0.01
+# White balance is told by pixels that agree to so much, and are no brighter than this part of what
+# is brightest; by so many standard errors.
+_SAME_LIGHT, _UNCLIPPED, _SURE = 0.03, 0.95, 4.0
 # Into about so many areas a picture's longer side is divided.
 _AREAS = 160
 # At least this part of the pixels must agree, and so many.
@@ -37,6 +47,72 @@ def frame_gain(image: Float32, reference: Float32) -> float:
     """
     centre = _agreed(_ratios(channel_sum(image), channel_sum(reference)))
     return 1.0 if centre is None or abs(centre) < _NOTHING else float(np.exp(centre))
+
+
+def row_gains(image: Float32, reference: Float32, rows: Float64) -> Gains:
+    """By how much some rows of a frame are brighter, in each channel, than those of the reference.
+
+    Args:
+        image, reference: as of `frame_gain`.
+        rows: (N,), places of rows, counted in those of the image.
+
+    Returns:
+        `frame_gain`, if that is all; else (N, 3).
+    """
+    level = frame_gain(image, reference)
+    own = np.arange(len(image), dtype=np.float64)
+    bands_of = band_gains(image, reference, level, np.concatenate([own, rows]))
+    flat = level if bands_of is None else level * bands_of[: len(own), np.newaxis] * np.ones(3)
+    tint = _tint(without_gain(image, flat), reference)
+    if bands_of is None and tint is None:
+        return level
+    along = np.ones(len(rows)) if bands_of is None else bands_of[len(own) :]
+    return level * along[:, np.newaxis] * (np.ones(3) if tint is None else tint)
+
+
+def _tint(image: NDArray[np.floating], reference: Float32) -> Float64 | None:
+    """By how much each channel is brighter than all together, (3,); None if none is."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        whole = np.log(channel_sum(image.astype(np.float32)) / channel_sum(reference))
+        same = np.abs(whole) < _SAME_LIGHT
+        if np.count_nonzero(same) < max(_LEAST_PART * same.size, _LEAST_PIXELS):
+            return None
+        now, then = image[same], reference[same]
+        usable = (then > 1e-2) & (now > 0) & (now < _UNCLIPPED * np.nanmax(image, axis=(0, 1)))
+        ratios = np.log(now / then)
+    off, error = np.zeros(3), np.zeros(3)
+    for channel in range(3):
+        own = ratios[usable[:, channel], channel]
+        if own.size < max(_LEAST_PART * same.size, _LEAST_PIXELS):
+            return None
+        off[channel] = _median(own)
+        # The standard error of a median of normal noise.
+        error[channel] = 1.25 * 1.48 * _median(np.abs(own - off[channel])) / np.sqrt(own.size)
+    off -= off.mean()
+    return None if np.abs(off).max() < max(_NOTHING, _SURE * error.max()) else np.exp(off)
+
+
+def is_one(gain: Gains) -> bool:
+    """Whether a frame has the reference's exposure."""
+    return isinstance(gain, float) and gain == 1
+
+
+def of_rows(gain: Gains, rows: slice) -> Gains:
+    """The gain of some rows of a picture."""
+    return gain if isinstance(gain, float) else gain[rows]
+
+
+def level_of(gain: Gains) -> float:
+    """A frame's gain altogether."""
+    return float(np.mean(gain))
+
+
+def unevenness(gain: Gains) -> float:
+    """By what part a row is brighter or darker than the frame altogether, at most."""
+    if isinstance(gain, float):
+        return 0.0
+    along = gain.mean(axis=1)
+    return float(np.abs(along / along.mean() - 1).max())
 
 
 def _ratios(now: Float32, then: Float32) -> Float32:
@@ -138,17 +214,22 @@ def common_reference(samples: list[Float32]) -> Float32:
     """What most of a sample of frames show, with their own gains taken out; (h, w, 3).
 
     Its own exposure is that of the most frames: where long shade pulls the median down, the light
-    that most of them agree in lifts it again.
+    that most of them agree in lifts it again. Bands are as often light as dark in each row.
     """
     reference = _middle(samples)
-    gains = [frame_gain(sample, reference) for sample in samples]
-    level = float(np.median(gains))
+    rows = np.arange(len(reference), dtype=np.float64)
+    gains = [row_gains(sample, reference, rows) for sample in samples]
+    level = float(np.median([level_of(gain) for gain in gains]))
     corrected = [
-        sample * np.float32(level / gain) for sample, gain in zip(samples, gains, strict=True)
+        without_gain(sample, gain / level) for sample, gain in zip(samples, gains, strict=True)
     ]
     reference = _middle(corrected)
-    usual = float(np.median([frame_gain(sample, reference) for sample in samples]))
-    return reference * np.float32(usual)
+    gains = [row_gains(sample, reference, rows) for sample in samples]
+    usual: Gains = float(np.median([level_of(gain) for gain in gains]))
+    if not all(isinstance(gain, float) for gain in gains):
+        uneven = [np.log(gain / level_of(gain)) for gain in gains if not isinstance(gain, float)]
+        usual = usual * np.exp(np.sum(uneven, axis=0) / len(gains))
+    return without_gain(reference, 1 / usual).astype(np.float32, copy=False)
 
 
 def _middle(samples: list[Float32]) -> Float32:
@@ -159,13 +240,21 @@ def _middle(samples: list[Float32]) -> Float32:
     return np.asarray(np.where(np.isnan(ordered[-1]), ordered[-1], middle), np.float32)
 
 
-def without_gain(image: NDArray[np.floating], gain: float) -> NDArray[np.floating]:
-    """The frame as it would be at gain 1; the very same array if it is."""
-    if gain == 1:
+def without_gain(image: NDArray[np.floating], gain: Gains) -> NDArray[np.floating]:
+    """The frame as it would be at gain 1; the very same array if it is.
+
+    Args:
+        image: (H, W, 3), or (H, W) for a gain that is one number.
+    """
+    if is_one(gain):
         return image
+    if isinstance(gain, float):
+        inverse = np.full(len(image), 1 / gain, np.float32).reshape(-1, *[1] * (image.ndim - 1))
+    else:
+        inverse = (1 / gain).astype(np.float32)[:, np.newaxis]
     if image.dtype != np.float16:
-        return image.astype(np.float32) * np.float32(1 / gain)
+        return image.astype(np.float32) * inverse
     corrected = np.empty_like(image)
     for rows in bands(image.shape):
-        corrected[rows] = rounded(to_float(image[rows]) * np.float32(1 / gain))
+        corrected[rows] = rounded(to_float(image[rows]) * inverse[rows])
     return corrected

@@ -12,6 +12,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.exposure import Gains, is_one, row_gains, without_gain
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
@@ -167,6 +169,7 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
     Returns:
         Dark to bright, each channel in turn; empty where no two frames can be compared.
     """
+    samples = _in_one_light(samples)
     firsts = sorted(a for a in samples if a % 2 == 0)
     near, far = (
         [(samples[a], samples[b]) for a, b in pairs]
@@ -209,6 +212,25 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
         else level
         for level in levels
     ]
+
+
+def _in_one_light(samples: Mapping[int, Float32]) -> Mapping[int, Float32]:
+    """Samples without changes of the light, if it changes from one frame to the next; all of them
+    in that of the first."""
+    rows = np.arange(max((len(image) for image in samples.values()), default=0), dtype=np.float64)
+
+    def gain(image: Float32, other: Float32) -> Gains:
+        with np.errstate(invalid="ignore", over="ignore"):
+            return row_gains(image, other, rows)
+
+    pairs = ((samples[a], samples[a + 1]) for a in samples if a % 2 == 0 and a + 1 in samples)
+    if all(is_one(gain(second, first)) for first, second in pairs):
+        return samples
+    first = samples[min(samples)]
+    return {
+        a: without_gain(image, gain(image, first)).astype(np.float32, copy=False)
+        for a, image in samples.items()
+    }
 
 
 def noise_model(levels: list[NoiseLevel], least: float = 2e-4) -> NoiseModel:

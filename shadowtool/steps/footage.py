@@ -171,6 +171,21 @@ def say_taken_as(name: object, transfer: str, remedy: str = "write it as EXR if 
         logger.warning("%s: PNG is taken as %s; %s", name, transfer, remedy)
 
 
+def say_flickers(footage: Footage, bands: float) -> None:
+    """Say that the light flickers, if it does.
+
+    Args:
+        bands: by what part rows are brighter or darker than their frame, at most.
+    """
+    if bands > 0:
+        logger.warning(
+            "%s: the light flickers, in bands that differ by up to %.1f%%; they are taken out, but"
+            " expose for a whole number of its periods, 1/50 s or 1/60 s as the mains has it",
+            footage.sequence.pattern,
+            100 * bands,
+        )
+
+
 def _require_same(path: Path, header: Header, first: Header, of: str) -> None:
     require_size(path, header, first, of)
     if header.coloured != first.coloured:

@@ -15,7 +15,7 @@ from shadowtool.core.backdrop import Backdrop, missing_shade
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.boxes import Box, around
 from shadowtool.core.camera_motion import Place, Vantage
-from shadowtool.core.exposure import frame_gain, without_gain
+from shadowtool.core.exposure import Gains, level_of, of_rows, row_gains, unevenness, without_gain
 from shadowtool.core.half_floats import not_finite, to_float
 from shadowtool.core.holdout import grid_step, on_grid
 from shadowtool.core.matting import (
@@ -42,6 +42,7 @@ from shadowtool.steps.footage import (
     require_frames,
     require_size,
     say_assumed,
+    say_flickers,
     say_taken_as,
 )
 from shadowtool.steps.keyframes import Keyframes
@@ -174,6 +175,7 @@ def matte(
             footage.sequence.pattern,
             moved,
         )
+    say_flickers(footage, result.figures.get("bands", 0))
     if result.figures.get("hidden", 0) > _TOO_MUCH:
         logger.warning(
             "%s: %.0f%% of the picture is taken for the figure; are these the plates of this take?",
@@ -244,14 +246,14 @@ class _Shown(NamedTuple):
         light: (H, W, 3), linear light as it is stored.
         header: the file's.
         bad: (H, W), where it is not finite; None for nowhere.
-        gain: how much brighter than the plates it is.
+        gain: how much brighter than the plates it is, or its rows and channels are.
         moved: from where it was seen to where the plates see it from, (x, y) in pixels.
     """
 
     light: NDArray[np.floating]
     header: Header
     bad: Bool | None
-    gain: float
+    gain: Gains
     moved: Place
 
     def at(self, box: Box) -> Float32:
@@ -259,7 +261,7 @@ class _Shown(NamedTuple):
         image = to_float(self.light[box])
         if self.bad is not None:
             image = np.where(self.bad[box][..., np.newaxis], np.float32(np.nan), image)
-        return without_gain(image, self.gain).astype(np.float32, copy=False)
+        return without_gain(image, of_rows(self.gain, box.rows)).astype(np.float32, copy=False)
 
 
 class _Figure(NamedTuple):
@@ -329,7 +331,8 @@ class _Take:
             "unknown": int(np.count_nonzero(unknown & ~hidden)),
             "hidden": int(np.count_nonzero(hidden)),
             "not_finite": 0 if shown.bad is None else int(np.count_nonzero(shown.bad)),
-            "gain": round(shown.gain, 6),
+            "gain": round(level_of(shown.gain), 6),
+            "bands": round(unevenness(shown.gain), 4),
             "moved": round(float(np.hypot(*shown.moved)), 3),
         }
         marked, header = with_figures(provenance, figures), shown.header
@@ -356,8 +359,12 @@ class _Take:
             name: round(sum(int(row.get(name, 0)) for row in rows) / pixels, 5) for name in names
         }
         gains = [float(row.get("gain", 1)) for row in rows] or [1.0]
-        moved = max((float(row.get("moved", 0)) for row in rows), default=0.0)
-        return parts | {"gain": {"least": min(gains), "most": max(gains)}, "moved": moved}
+        bands, moved = (
+            max((float(row.get(name, 0)) for row in rows), default=0.0)
+            for name in ("bands", "moved")
+        )
+        gain = {"least": min(gains), "most": max(gains)}
+        return parts | {"gain": gain, "bands": bands, "moved": moved}
 
     def _file(self, product: Only, frame: Frame) -> Path:
         folder, suffix = PRODUCTS[product]
@@ -367,10 +374,12 @@ class _Take:
         stored = self.footage.image(frame)
         light, place = self.footage.light(stored)
         bad = not_finite(light)
-        gain = 1.0
+        gain: Gains = 1.0
         if self.gain == "auto":
+            step = self.scene.step
+            rows = np.arange(stored.header.height) / step
             with np.errstate(invalid="ignore"):
-                gain = frame_gain(on_grid(light, self.scene.step), self.scene.reference)
+                gain = row_gains(on_grid(light, step), self.scene.reference, rows)
         return _Shown(light, stored.header, bad, gain, place)
 
     def _figure(self, frame: Frame, shown: _Shown) -> _Figure:

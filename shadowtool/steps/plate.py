@@ -13,7 +13,16 @@ from numpy.typing import NDArray
 from shadowtool.choices import Estimator, Gain, Missing, Reading, Steady
 from shadowtool.core.beta import shadow_contrast
 from shadowtool.core.camera_motion import Place
-from shadowtool.core.exposure import common_reference, frame_gain, without_gain
+from shadowtool.core.exposure import (
+    Gains,
+    common_reference,
+    is_one,
+    level_of,
+    of_rows,
+    row_gains,
+    unevenness,
+    without_gain,
+)
 from shadowtool.core.half_floats import not_finite, shortened
 from shadowtool.core.holdout import (
     Background,
@@ -49,6 +58,7 @@ from shadowtool.steps.footage import (
     require_frames,
     require_size,
     say_assumed,
+    say_flickers,
 )
 from shadowtool.steps.plane import read_plane
 from shadowtool.steps.run import (
@@ -247,6 +257,7 @@ def plate(
                 if take.footage.vantage is not None
                 else f"plates are off where texture is strong; hold it firmly, or give {cure}",
             )
+    say_flickers(footage, take.bands)
     if figures.get("shaded") == 0:
         logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
     elif figures.get("read_as") == UNDER_A_CARD and figures["shaded"] < _WELL_SHADED:
@@ -292,7 +303,7 @@ class _Shown(NamedTuple):
     holdout: NDArray[np.number] | None
     keys: Keyed | None
     marks: list[str]
-    gain: float
+    gain: Gains
     place: Place
 
 
@@ -320,6 +331,7 @@ class _Take:
         known_gains: of the sampled frames.
         masks: their automatic holdouts on the grid, once they are known.
         gains: of the frames that were used, where they are not 1.
+        bands: by what part their rows differ in brightness, at most.
         trembling: by how much the camera's place varies, pixels; None where it wasn't measured.
         not_finite: how many of their pixels are NaN or infinite.
         folder: where the automatic one is written.
@@ -337,9 +349,10 @@ class _Take:
     background: Background | None = None
     reference: NDArray[np.float32] | None = None
     kept: dict[Frame, _Kept] = field(default_factory=dict)
-    known_gains: dict[Frame, float] = field(default_factory=dict)
+    known_gains: dict[Frame, Gains] = field(default_factory=dict)
     masks: dict[Frame, Bool] = field(default_factory=dict)
     gains: dict[str, float] = field(default_factory=dict)
+    bands: float = 0.0
     trembling: float | None = None
     not_finite: dict[str, int] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
@@ -360,16 +373,24 @@ class _Take:
         """What the automatic holdout looks at of a frame."""
         return on_grid(values, self.step)
 
-    def gain(self, frame: Frame, grid: NDArray[np.float32]) -> float:
+    def gain(self, frame: Frame, grid: NDArray[np.float32]) -> Gains:
         """A frame's exposure, from its grid."""
         if self.reference is None:
             return 1.0
         known = self.known_gains.get(frame)
-        return frame_gain(self.sparse(grid), self.reference) if known is None else known
+        if known is not None:
+            return known
+        rows = np.arange(self.footage.header.height) / (self.step * self.thinning)
+        return row_gains(self.sparse(grid), self.reference, rows)
+
+    @property
+    def thinning(self) -> int:
+        """Exposure takes fewer pixels than a figure's outline, unless there are few."""
+        return 1 if self.step == 1 else 2
 
     def sparse(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Exposure takes fewer pixels than a figure's outline, unless there are few."""
-        return grid if self.step == 1 else grid[::2, ::2]
+        """What exposure takes of a grid."""
+        return grid[:: self.thinning, :: self.thinning]
 
     def shown(self, frames: list[Frame], with_keys: bool, last: bool) -> Iterator[_Shown | None]:
         """Each frame in turn, None for those that are skipped.
@@ -389,7 +410,7 @@ class _Take:
                     needed = not last or self.reference is not None or self.background is not None
                     grid = self.grid(values) if needed else _NO_GRID
                 gain = self.gain(frame, grid)
-                if gain != 1:
+                if not is_one(gain):
                     values = without_gain(values, gain)
                     grid = self.grid(values)
                 marks = [mark]
@@ -442,8 +463,9 @@ class _Take:
             else:
                 self.used.append(frames[position])
                 self.marks += item.marks
-                if item.gain != 1:
-                    self.gains[str(frames[position])] = round(item.gain, 6)
+                if not is_one(item.gain):
+                    self.gains[str(frames[position])] = round(level_of(item.gain), 6)
+                    self.bands = max(self.bands, round(unevenness(item.gain), 4))
                 yield position, item
             self.run.progress(begun + position + 1, total)
         if not self.used:
@@ -512,7 +534,8 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     # Where a figure is held out by what was given it is a source.
     undecided = take.held is None and take.card is None
     if apart and (undecided or (automatic and not take.card)):
-        level = [grids[frame] / np.float32(gains[frame]) for frame in apart]
+        on_grid_rows = slice(None, None, take.step)
+        level = [without_gain(grids[frame], of_rows(gains[frame], on_grid_rows)) for frame in apart]
         background = find_background(level, noise)
         if take.card is None and background.under_card:
             take.card = True
@@ -523,7 +546,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
     levels = SampledLevels(height, width)
     if with_levels:
         # The others, that were kept or whose exposure is off, are keyed now that all is known.
-        ready = [frame for frame in grays if gains[frame] == 1]
+        ready = [frame for frame in grays if is_one(gains[frame])]
         for frame in ready:
             if take.background is not None:
                 hide(grays[frame], take.automatic(frame, grids[frame], last=False) > 0)
@@ -586,6 +609,7 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         reading = "a plane that a shadow crossed" if completed.partial else UNDER_A_CARD
         figures: Figures = {
             "gains": take.gains,
+            "bands": take.bands,
             "shaded": round(float(shaded.mean()), 4),
             "own_evidence": round(float(completed.own[seen].mean()), 4) if seen.any() else 0.0,
             "read_as": reading if shaded.any() else "a scene without shadow",

@@ -10,6 +10,7 @@ from shadowtool.core import (
     compositing,
     exposure,
     filling,
+    flicker,
     half_keys,
     noise,
     trembling,
@@ -313,6 +314,16 @@ CONTRACTS = {
         lambda a: exposure.frame_gain(a, a),
         lambda h, w: st.tuples(picture(h, w)),
         lambda r, a: r == 1.0,
+    ),
+    "row_gains": Contract(
+        lambda a, b: exposure.row_gains(a, b, np.arange(len(a), dtype=float)),
+        lambda h, w: st.tuples(picture(h, w), picture(h, w)),
+        lambda r, a, b: np.shape(r) in ((), (len(a), 3)) and np.all((r > 0.5) & (r < 2)),
+    ),
+    "band_gains": Contract(
+        lambda a, b: flicker.band_gains(a, b, 1.0, np.arange(2.0 * len(a))),
+        lambda h, w: st.tuples(picture(6 * h, 6 * w), picture(6 * h, 6 * w)),
+        lambda r, a, b: r is None or (r.shape == (2 * len(a),) and (r > 0).all()),
     ),
     "without_gain": Contract(
         exposure.without_gain,

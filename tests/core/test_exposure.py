@@ -7,7 +7,12 @@ from shadowtool.core.exposure import (
     RunningGain,
     common_reference,
     frame_gain,
+    is_one,
+    level_of,
+    of_rows,
+    row_gains,
     sampled_areas,
+    unevenness,
     without_gain,
 )
 from tests.scene import Scene
@@ -59,6 +64,59 @@ def test_taking_a_gain_out_keeps_the_type_and_the_input(dtype: type) -> None:
     assert corrected.dtype == dtype
     assert corrected == pytest.approx(SCENE.lit, rel=2e-3 if dtype == np.float16 else 1e-5)
     assert np.array_equal(brighter, before)
+
+
+ROWS = np.arange(SCENE.height, dtype=float)
+BANDS = 1 + 0.05 * np.sin(2 * np.pi * (1.7 * ROWS / SCENE.height + 0.2))
+TINT = np.array([1.04, 1.0, 0.95])
+
+
+@pytest.mark.parametrize("bands", [np.ones(SCENE.height), BANDS], ids=["steady", "flickering"])
+@pytest.mark.parametrize("tint", [np.ones(3), TINT], ids=["white", "tinted"])
+@pytest.mark.parametrize("level", [1.0, 0.92])
+def test_bands_and_tints_are_found_beside_the_level(
+    bands: np.ndarray, tint: np.ndarray, level: float
+) -> None:
+    true = level * bands[:, None] * tint
+    gains = row_gains(crossed(80, 45, 3) * true[:, None].astype(np.float32), SCENE.lit, ROWS)
+    if np.ptp(true) == 0:
+        assert gains == frame_gain(crossed(80, 45, 3) * np.float32(level), SCENE.lit)
+    assert np.broadcast_to(gains, true.shape) == pytest.approx(true, abs=0.012)
+
+
+def test_a_channel_that_is_clipped_has_no_tint() -> None:
+    brighter = np.minimum(crossed(80, 45, 1) * np.float32([1.08] * 3), np.float32([0.45, 2, 2]))
+    assert isinstance(row_gains(brighter, np.minimum(SCENE.lit, [0.45, 2, 2]), ROWS), float)
+
+
+def test_gains_of_rows_are_taken_out_of_them() -> None:
+    gains = BANDS[:, None] * TINT
+    image = (SCENE.lit * gains[:, None]).astype(np.float32)
+    assert without_gain(image, gains) == pytest.approx(SCENE.lit, rel=1e-5)
+    assert without_gain(image[20:40], of_rows(gains, slice(20, 40))) == pytest.approx(
+        SCENE.lit[20:40], rel=1e-5
+    )
+    assert of_rows(0.9, slice(20, 40)) == 0.9
+    halfs = without_gain(image.astype(np.float16), gains)
+    assert halfs.dtype == np.float16 and halfs == pytest.approx(SCENE.lit, rel=2e-3)
+
+
+def test_what_gains_amount_to() -> None:
+    gains = 0.9 * BANDS[:, None] * TINT
+    assert level_of(gains) == pytest.approx(0.9 * BANDS.mean() * TINT.mean())
+    assert unevenness(gains) == pytest.approx(0.05, rel=0.05)
+    assert (level_of(0.9), unevenness(0.9), is_one(0.9)) == (0.9, 0, False)
+    assert is_one(1.0) and not is_one(np.ones((4, 3)))
+
+
+def test_the_reference_of_a_flickering_take_has_no_bands() -> None:
+    samples = []
+    for number, frame in enumerate(take()):
+        angle = 2 * np.pi * (1.7 * ROWS / SCENE.height + 0.37 * number)
+        samples.append((frame * (1 + 0.06 * np.sin(angle))[:, None, None]).astype(np.float32))
+    reference = common_reference(samples)
+    rows = np.median(np.log(reference / SCENE.lit), axis=(1, 2))
+    assert np.abs(rows).max() < 0.01
 
 
 def test_what_is_unknown_is_passed_over() -> None:

@@ -48,6 +48,16 @@ def test_photon_and_read_noise_are_found_from_the_take(moving: bool) -> None:
         assert model.sigma(np.full(3, value)) == pytest.approx([true] * 3, rel=0.15)
 
 
+@pytest.mark.parametrize("tint", [1.0, np.array([1.1, 1.0, 0.9])])
+def test_a_lamp_that_flickers_makes_no_noise(tint: np.ndarray | float) -> None:
+    shots = take(24)
+    waves = np.sin(2 * np.pi * np.arange(120) / 70)[:, None, None]
+    for number in range(1, 24, 2):
+        shots[number] = shots[number] * (tint - 0.06 * waves)
+    true = np.sqrt(SLOPE * 0.18 + FLOOR)
+    assert model_of(shots).sigma(np.full(3, 0.18)) == pytest.approx([true] * 3, rel=0.2)
+
+
 def test_noise_that_a_codec_freezes_is_found_between_distant_frames() -> None:
     shots = take(24)
     frozen = [shots[4 * (number // 4)] for number in range(24)]

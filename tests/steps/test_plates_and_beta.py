@@ -440,6 +440,27 @@ def test_gains_are_recorded(takes: Path, level_plates: Path, tmp_path: Path) -> 
     assert [n for n in NUMBERS if rows[str(n)]["gain"] != 1] == list(DIP)
 
 
+def test_what_flickers_is_level_and_is_said(
+    level_plates: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    waves = 2 * np.pi * 1.5 * ROWS / HEIGHT
+    bands = {n: 1 + 0.06 * np.sin(waves + 2.3 * n)[..., None] for n in NUMBERS}
+    flickering = (picture(n) * bands[n].astype(np.float16) for n in NUMBERS)
+    take = write_frames(tmp_path / "flickering", flickering)
+    plate(take, tmp_path / "plates", holdout="none", read_as="plane")
+    matte(take, tmp_path / "matte", plates=tmp_path / "plates", only="beta")
+    assert sum("flickers" in record.message for record in caplog.records) == 2
+    found, plain = plates_of(tmp_path / "plates"), plates_of(level_plates / "plain")
+    assert error(found.lit, plain.lit).mean() < 0.01
+    for folder in ("plates", "matte"):
+        assert figures_of(tmp_path / folder)["bands"] == pytest.approx(0.06, abs=0.02)
+    off = [beta_of(tmp_path / "matte", n)[:25] - 1 for n in NUMBERS]
+    assert np.abs(off).mean() < 0.005
+    matte(take, tmp_path / "as-is", plates=tmp_path / "plates", only="beta", gain="none")
+    off = [beta_of(tmp_path / "as-is", n)[:25] - 1 for n in NUMBERS]
+    assert np.abs(off).mean() > 0.01
+
+
 def test_a_steady_take_has_no_gains(takes: Path, level_plates: Path, tmp_path: Path) -> None:
     plate(takes / "plain", tmp_path / "none", holdout="none", read_as="plane", gain="none")
     assert figures_of(level_plates / "plain")["gains"] == {}

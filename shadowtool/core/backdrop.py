@@ -1,7 +1,7 @@
 """What a locked-off camera can see of the background: the line from S to L, and a little below S.
 
-β is carried on below 0: there the background is (1 + β)S, ground that a figure near to it takes
-some of the sky from, or whose S is only guessed.
+A figure takes some of the sky from ground that is near to it, so of S some may be missing at any β.
+β is carried on below 0: there the background is (1 + β)S, and S may be only guessed.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,8 @@ Places = tuple[slice, ...] | tuple[NDArray[np.intp], ...]
 
 # How much of S may be missing near to what stands on it.
 _DEEPEST = 0.5
-# So far from all shade, as a part of the picture's longer side, hardly more than a part is missing.
+# So far from all shade, as a part of the picture's longer side, and where there is light, hardly
+# more than a part is missing, a standard deviation.
 _FROM_SHADE, _HARDLY = 1 / 30, 0.12
 # What is narrower, pixels, is no shade but noise.
 _SPECKS = 5
@@ -31,8 +32,9 @@ class Nearest(NamedTuple):
     """The background that is likest to a pixel.
 
     Attributes:
-        beta: (H, W) float32, from -0.5 to 1.
-        distance2: (H, W) float32 ≥ 0, squared distance from it in standard deviations.
+        beta: (H, W) float32, from -0.5 to 1; above 0 as if nothing of the sky were missing.
+        distance2: (H, W) float32 ≥ 0, squared distance from it in standard deviations, of which
+            how much is missing is one.
         from_lit2: (H, W) float32 ≥ 0, the same from L alone.
     """
 
@@ -132,9 +134,7 @@ class Backdrop:
         square, from_lit2 = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         dots = np.zeros((2, *shape), np.float32)
         lengths = np.full((2, *shape), 1e-9, np.float32)
-        if self.missing is not None:
-            # As one more measurement, that nothing is missing.
-            lengths[1] += 1 / self.missing**2
+        across = np.zeros(shape, np.float32)
         # By channel: sums over an axis of three are slow, and so is what lies apart in memory.
         for channel in range(3):
             value, lit, shadow = (
@@ -151,17 +151,27 @@ class Backdrop:
             for direction, dot, length in zip((span, shadow), dots, lengths, strict=True):
                 dot += weight * direction * above
                 length += weight * direction**2
-        between, below = (
-            np.clip(dot / length, low, high)
-            for dot, length, low, high in zip(dots, lengths, (0, -_DEEPEST), (1, 0), strict=True)
-        )
-        off_between, off_below = (
-            np.maximum(square - part * (2 * dot - part * length), 0)
-            for part, dot, length in zip((between, below), dots, lengths, strict=True)
-        )
+            across += weight * span * shadow
+        of_span, of_shadow = dots
+        along, dark = lengths
+        # As one more measurement, that nothing of the sky is missing.
+        held = dark + np.float32(1 / _HARDLY**2)
+        missing = across * of_span - along * of_shadow
+        missing /= np.maximum(along * held - across**2, np.float32(1e-9))
+        np.clip(missing, 0, _DEEPEST, out=missing)
+        lit = np.clip((of_span + missing * across) / along, 0, 1)
+        # Where one of them is at its end the other is what goes with that.
+        missing = np.clip((lit * across - of_shadow) / held, 0, _DEEPEST)
+        off_between = square - lit * (2 * (of_span + missing * across) - lit * along)
+        off_between += missing * (2 * of_shadow + missing * held)
+        between = np.clip(of_span / along, 0, 1)
+        if self.missing is not None:
+            dark = dark + 1 / self.missing**2
+        below = np.clip(of_shadow / dark, -_DEEPEST, 0)
+        off_below = square - below * (2 * of_shadow - below * dark)
         deeper = off_below < off_between
         return Nearest(
             np.where(deeper, below, between),
-            np.where(deeper, off_below, off_between),
+            np.maximum(np.where(deeper, off_below, off_between), 0),
             from_lit2,
         )

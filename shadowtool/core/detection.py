@@ -21,9 +21,14 @@ Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 
-# What is still evidence for the background: half a squared distance from its line, and from L.
-# A figure's colours are spread over so many times more of what a pixel can be.
-_NEAR_LINE, _NEAR_LIT = 5.0, 9.0
+# What is still evidence for the background: half a squared distance from its line, between the
+# first two, and from L. A figure's colours are spread over so many times more of what a pixel can
+# be.
+_NEAR_LINE, _NEAR_LIT = (2.5, 5.0), 9.0
+# The first is for noise, of which hardly any mean over so many pixels squared of lit ground is so
+# many times as large as the median; the larger these are, as in compressed footage, the nearer it
+# is to the second. Of fewer pixels nothing is told.
+_MEAN, _TAIL, _HARDLY_ANY, _LEAST_LIT = 5, 1.6, 0.95, 500
 # No single pixel's colour says more than this, and no step between two.
 _MOST, _MOST_TEXTURE = 8.0, 6.0
 # A trimap from another frame is worth as much: it decides where colours don't.
@@ -73,8 +78,7 @@ class Found(NamedTuple):
 def changed(image: Float32, backdrop: Backdrop) -> Bool:
     """Where a frame is not plainly lit ground, (H, W)."""
     # By itself the mean of nine squared distances is 3; noise alone does not get it to 9.
-    square = np.minimum(backdrop.from_lit2(image), np.float32(100))
-    return np.asarray(cv2.blur(square, (3, 3)) > 9)
+    return np.asarray(_blurred(backdrop.from_lit2(image), 3) > _ON_LIT2)
 
 
 def find_figure(
@@ -99,16 +103,26 @@ def find_figure(
     other = texture_evidence(image, backdrop)
     other[unknown] = 0
     other += np.float32(_HINT) * _leaning(hint)
+    near_line = _near_line(nearest, unknown)
     guide = (np.clip(image, 0, 1) ** np.float32(_GUIDE_POWER) * 255).astype(np.uint8)
 
-    def mask_of(distance2: Float32) -> Bool:
-        evidence = np.minimum(distance2 / 2 - _NEAR_LINE, nearest.from_lit2 / 2 - _NEAR_LIT)
+    square = np.ones((3, 3), np.uint8)
+
+    def within(distance2: Float32, near: float) -> UInt8:
+        evidence = np.minimum(distance2 / 2 - near, nearest.from_lit2 / 2 - _NEAR_LIT)
         evidence = np.clip(evidence, -_MOST, _MOST)
         evidence[unknown] = 0
         evidence += other
         shared = cv2.ximgproc.fastGlobalSmootherFilter(guide, evidence, _SHARING, _LIKE)
-        figure = (shared > 0).astype(np.uint8)
-        square = np.ones((3, 3), np.uint8)
+        return (shared > 0).astype(np.uint8)
+
+    def mask_of(distance2: Float32) -> Bool:
+        figure = within(distance2, _NEAR_LINE[1])
+        if near_line < _NEAR_LINE[1]:
+            # What is so near to the line is told by many pixels together alone.
+            more = within(distance2, near_line) & (1 - figure)
+            thick = cv2.morphologyEx(more, cv2.MORPH_OPEN, np.ones((reach + 1,) * 2, np.uint8))
+            figure |= _connected(more > 0, thick > 0).view(np.uint8)
         edge = (cv2.dilate(figure, square) > 0) & (cv2.erode(figure, square) == 0)
         figure[edge & (distance2 > _OFF_LINE2)] = 1
         figure[(nearest.from_lit2 < _ON_LIT2) & (other < 0) & ~unknown] = 0
@@ -126,6 +140,26 @@ def find_figure(
     limbs = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
     strands = (distance2 > _OFF_LINE2) & (nearest.from_lit2 > _OFF_LINE2) & ~unknown
     return Found(limbs, _connected(mask | strands, limbs), float(excess.max()))
+
+
+def _near_line(nearest: Nearest, unknown: Bool) -> float:
+    """Half the squared distance from its line within which a pixel is background, as far as lit
+    ground tells.
+
+    What noise leaves of it averages out; blocks that a codec did not send anew do not.
+    """
+    lit = (_blurred(nearest.from_lit2, 3) < _ON_LIT2) & ~unknown
+    off = _blurred(nearest.distance2, _MEAN)[lit]
+    least, most = _NEAR_LINE
+    if off.size < _LEAST_LIT:
+        return most
+    middle, tail = np.quantile(off, (0.5, _HARDLY_ANY))
+    return float(np.clip(least * tail / max(_TAIL * middle, 1e-6), least, most))
+
+
+def _blurred(square: Float32, size: int) -> Float32:
+    """The mean of squared distances around each pixel, none of which counts for very much."""
+    return np.asarray(cv2.blur(np.minimum(square, np.float32(100)), (size, size)), np.float32)
 
 
 def _without_shadow(

@@ -12,15 +12,19 @@ SMALL = BACKDROP.at((slice(0, 4), slice(0, 5)))
 
 
 def searched(image: np.ndarray, backdrop: Backdrop) -> tuple[np.ndarray, np.ndarray]:
-    """β and squared distance by trying every β in turn."""
-    best = np.full(image.shape[:2], np.inf)
+    """β by trying every one in turn, and squared distance with any part of the sky missing, too."""
+    nearest, best = (np.full(image.shape[:2], np.inf) for _ in "01")
     beta = np.zeros(image.shape[:2])
     variance = backdrop.variance(image)
-    for part in np.linspace(-0.5, 1, 601):
+    for part in np.linspace(-0.5, 1, 301):
         shown = backdrop.under(np.full(image.shape[:2], part, np.float32))
-        distance2 = ((image - shown) ** 2 / variance).sum(axis=-1)
-        beta = np.where(distance2 < best, part, beta)
-        best = np.minimum(best, distance2)
+        for missing in np.linspace(0, 0.5, 51) if part >= 0 else [0.0]:
+            dimmed = shown - np.float32(missing) * backdrop.shadow
+            distance2 = ((image - dimmed) ** 2 / variance).sum(axis=-1) + (missing / 0.12) ** 2
+            best = np.minimum(best, distance2)
+            if missing == 0:
+                beta = np.where(distance2 < nearest, part, beta)
+                nearest = np.minimum(nearest, distance2)
     return beta, best
 
 
@@ -43,6 +47,15 @@ def test_the_background_lies_on_its_own_line(part: float) -> None:
     found = SMALL.nearest(SMALL.under(beta))
     assert found.distance2 == pytest.approx(0, abs=1e-2)
     assert found.beta == pytest.approx(beta, abs=1e-3)
+
+
+@given(st.floats(0, 1), st.floats(0, 0.24))
+def test_ground_that_misses_some_of_the_sky_is_ground_in_any_light(
+    part: float, missing: float
+) -> None:
+    beta = np.full(SMALL.lit.shape[:2], part, np.float32)
+    found = SMALL.nearest(SMALL.under(beta) - np.float32(missing) * SMALL.shadow)
+    assert (found.distance2 <= (missing / 0.12) ** 2 + 0.01).all()
 
 
 def test_away_from_all_shade_hardly_anything_is_darker_than_it() -> None:
@@ -83,7 +96,7 @@ def test_the_distance_from_light_is_the_same_by_itself() -> None:
 def test_a_shadow_plate_that_is_only_guessed_is_held_to_less() -> None:
     doubt = np.full(SCENE.lit.shape[:2], 0.05, np.float32)
     guessed = Backdrop(SCENE.lit, SCENE.shadow, BACKDROP.noise, doubt)
-    other_hue = SCENE.shadow * np.float32([1.05, 1, 0.95])
+    other_hue = SCENE.shadow * np.float32([0.95, 1, 1.05])
     sure, unsure = BACKDROP.nearest(other_hue), guessed.nearest(other_hue)
     assert np.median(unsure.distance2) < 0.5 * np.median(sure.distance2)
     # It makes little difference in the light.

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -58,6 +60,49 @@ def test_what_looks_like_shadow_is_figure_where_there_is_none_around(radius: int
     image[disk(94 + radius, 50, radius) >= 1] = 0.125
     mask = found_in(SCENE.noisy(image, 1), backdrop).mask
     assert (mask[rim].mean() > 0.95) == (radius == 0)
+
+
+def near_the_line(place: np.ndarray) -> np.ndarray:
+    """Ground without texture, and something as dark as its shade that is of a little other hue."""
+    even = np.full_like(SCENE.lit, 0.5)
+    shade = np.float32([0.125, 0.125, 0.125])
+    # Three standard deviations off the line, on either side of it.
+    off = 3 * EVEN.noise.sigma(shade) * np.float32([1, -1, 0]) / np.sqrt(2)
+    image = np.where(disk(70, 50, 20)[..., None] == 1, np.float32([0.05, 0.1, 0.6]), even)
+    return SCENE.noisy(np.where(place[..., None], shade + off, image).astype(np.float32), 3)
+
+
+EVEN = replace(BACKDROP, lit=np.full_like(SCENE.lit, 0.5), shadow=np.full_like(SCENE.lit, 0.125))
+CLOTHES, SLIVER = np.zeros_like(KNOWN), np.zeros_like(KNOWN)
+CLOTHES[62:86, 60:80] = True
+SLIVER[69:72, 60:80] = True
+
+
+def test_many_pixels_together_tell_clothes_from_shade_of_nearly_their_colour() -> None:
+    # A shadow beside them, lest they be told by there being none.
+    image = near_the_line(CLOTHES)
+    image[40:80, 95:120] = SCENE.noisy(EVEN.shadow, 4)[40:80, 95:120]
+    mask = found_in(image, EVEN).mask
+    assert mask[CLOTHES].mean() > 0.9
+    assert mask[40:80, 95:120].mean() < 0.01
+
+
+def test_a_few_pixels_do_not() -> None:
+    image = near_the_line(SLIVER)
+    image[40:80, 95:120] = SCENE.noisy(EVEN.shadow, 4)[40:80, 95:120]
+    assert found_in(image, EVEN).mask[SLIVER].mean() < 0.5
+
+
+def test_where_errors_are_those_of_blocks_they_do_not_add_up() -> None:
+    image = near_the_line(CLOTHES)
+    image[40:80, 95:120] = SCENE.noisy(EVEN.shadow, 4)[40:80, 95:120]
+    rng = np.random.default_rng(0)
+    blocks = np.kron(rng.random((13, 20, 1)) < 0.1, np.ones((8, 8, 1)))[: len(image)]
+    hue = 2.5 * EVEN.noise.sigma(EVEN.lit) * np.float32([1, -1, 0])
+    lit = found_in(EVEN.lit + blocks * hue, EVEN)
+    assert not lit.mask.any()
+    blocky = np.where(CLOTHES[..., None], image, image + blocks * hue).astype(np.float32)
+    assert found_in(blocky, EVEN).mask[CLOTHES].mean() < found_in(image, EVEN).mask[CLOTHES].mean()
 
 
 def test_a_hair_hangs_on_the_head() -> None:

@@ -77,19 +77,16 @@ def _tint(image: NDArray[np.floating], reference: Float32) -> Float64 | None:
         same = np.abs(whole) < _SAME_LIGHT
         if np.count_nonzero(same) < max(_LEAST_PART * same.size, _LEAST_PIXELS):
             return None
-        now, then = image[same], reference[same]
-        usable = (then > 1e-2) & (now > 0) & (now < _UNCLIPPED * np.nanmax(image, axis=(0, 1)))
-        ratios = np.log(now / then)
-    off, error = np.zeros(3), np.zeros(3)
-    for channel in range(3):
-        own = ratios[usable[:, channel], channel]
-        if own.size < max(_LEAST_PART * same.size, _LEAST_PIXELS):
-            return None
-        off[channel] = _median(own)
-        # The standard error of a median of normal noise.
-        error[channel] = 1.25 * 1.48 * _median(np.abs(own - off[channel])) / np.sqrt(own.size)
-    off -= off.mean()
-    return None if np.abs(off).max() < max(_NOTHING, _SURE * error.max()) else np.exp(off)
+        clear = same & (image < _UNCLIPPED * np.nanmax(image, axis=(0, 1))).all(axis=-1)
+    now, then = image[clear].astype(np.float64), reference[clear].astype(np.float64)
+    if len(now) < max(_LEAST_PART * same.size, _LEAST_PIXELS) or (then.mean(axis=0) < 1e-2).any():
+        return None
+    # Of sums, as the ratios of single dark pixels are no more than noise.
+    tint = now.mean(axis=0) / then.mean(axis=0)
+    tint /= np.exp(np.log(np.maximum(tint, 1e-6)).mean())
+    error = (now - tint * then).std(axis=0) / (then.mean(axis=0) * np.sqrt(len(now)))
+    off = np.abs(np.log(np.maximum(tint, 1e-6))).max()
+    return None if off < max(_NOTHING, _SURE * error.max()) else tint
 
 
 def is_one(gain: Gains) -> bool:

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.exposure import Gains, is_one, row_gains, without_gain
+from shadowtool.core.exposure import Gains, row_gains, without_gain
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -34,6 +34,8 @@ _LIGHT, _SHADE, _LEAST_TILES = 0.8, 0.6, 4
 # If more than the second part of it was darker than the first part of what it was at most, before
 # or after, penumbrae are what rare pixels are off by.
 _HALF_LIT, _FEW = 0.9, 0.06
+# Light that changes by less from one frame to the next leaves noise as it is.
+_STEADY = 0.03
 _LEVELS = 12
 # Of the variance at the darkest level that was measured this part is left at none; if that is
 # darker than this, nothing is to be guessed.
@@ -224,7 +226,8 @@ def _in_one_light(samples: Mapping[int, Float32]) -> Mapping[int, Float32]:
             return row_gains(image, other, rows)
 
     pairs = ((samples[a], samples[a + 1]) for a in samples if a % 2 == 0 and a + 1 in samples)
-    if all(is_one(gain(second, first)) for first, second in pairs):
+    gains = [gain(second, first) for first, second in pairs]
+    if all(isinstance(own, float) and abs(own - 1) < _STEADY for own in gains):
         return samples
     first = samples[min(samples)]
     return {

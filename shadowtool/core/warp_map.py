@@ -50,15 +50,21 @@ class WarpMap:
 
 @dataclass(frozen=True)
 class Pass:
-    """One scan: the times of its leading edge and the lines on the reference plane."""
+    """One scan: the times of its leading edge and the lines on the reference plane.
+
+    Attributes:
+        plane: (H, W), what was marked as the reference plane; None where that isn't known.
+    """
 
     times: ShadowTimes
     lines: ShadowLines
+    plane: Bool | None = None
 
     def part(self, rows: slice, columns: slice = slice(None)) -> "Pass":
         """The same scan of a part of the picture; the lines keep the whole's coordinates."""
         parts = {f.name: getattr(self.times, f.name)[rows, columns] for f in fields(self.times)}
-        return Pass(ShadowTimes(**parts), self.lines)
+        plane = None if self.plane is None else self.plane[rows, columns]
+        return Pass(ShadowTimes(**parts), self.lines, plane)
 
 
 def identity_map(height: int, width: int) -> Float32:

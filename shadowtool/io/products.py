@@ -138,7 +138,11 @@ def confidence_layers(
 
 
 def encode_times(
-    folder: Path, times: ShadowTimes, header: Header, provenance: Provenance
+    folder: Path,
+    times: ShadowTimes,
+    plane: NDArray[np.bool_] | None,
+    header: Header,
+    provenance: Provenance,
 ) -> memoryview:
     """The bytes of the folder's ``scan.exr``, which take a while and don't depend on the lines.
 
@@ -148,6 +152,8 @@ def encode_times(
     layers = {part.name: getattr(times, part.name) for part in fields(times)}
     layers |= {name: rounded(layers[name]) for name in ("error", "own_error")}
     layers["contrast"] = to_float(rounded(times.contrast))
+    if plane is not None:
+        layers["plane"] = plane.astype(np.float16)
     return encode_exr(folder / SCAN, layers, header, provenance, quick=True)
 
 
@@ -164,7 +170,7 @@ def write_scan(
         encoded: what `encode_times` made of the pass's times, if it was called before.
     """
     if encoded is None:
-        encoded = encode_times(folder, scan.times, header, provenance)
+        encoded = encode_times(folder, scan.times, scan.plane, header, provenance)
     write_bytes(folder / SCAN, encoded)
     lines = scan.lines
     rows = [
@@ -194,7 +200,8 @@ def read_scan(folder: Path) -> tuple[Pass, Header, str]:
     image = read_image(folder / SCAN)
     data = read_bytes(folder / LINES)
     lines = _parse_lines(folder / LINES, data, image)
-    scan = Pass(_parse_times(image), lines)
+    plane = image.channel("plane") > 0.5 if "plane" in image.layers else None
+    scan = Pass(_parse_times(image), lines, plane)
     return scan, image.header, f"{image.fingerprint} {fingerprint(data)}"
 
 

@@ -171,7 +171,9 @@ def scan(
         )
     mark = _mark(recipe, plane_mark, dict(zip(used, marks, strict=True)))
     provenance = recipe.provenance(mark)
-    with meanwhile(lambda: encode_times(output, times, footage.header, provenance)) as encoded:
+    with meanwhile(
+        lambda: encode_times(output, times, region, footage.header, provenance)
+    ) as encoded:
         points = zero_crossings(times.time, region, numbers)
         lines = _lines(points, numbers, raised, footage.sequence.pattern)
 
@@ -189,7 +191,7 @@ def scan(
                 "off_lines": round(float(off.mean()), 4) if off.size else 0.0,
             }
             _advise(figures, footage)
-            write_scan(output, Pass(times, lines), footage.header, provenance, encoded())
+            write_scan(output, Pass(times, lines, region), footage.header, provenance, encoded())
             drawn()
     write_manifest(output, recipe, mark, figures)
     return Result("scan", output, used, 0, skipped, figures)

@@ -19,13 +19,23 @@ Float32 = NDArray[np.float32]
 
 # About so many pixels are enough to find the light's image.
 _THIN = 200_000
+# If displacements miss the light's image by more than this, pixels, and without one of the passes
+# by less than this part of that, it is that pass that is wrong.
+_MISSED, _WRONG = 0.5, 0.4
 
 
 class Solved(NamedTuple):
-    """W as measured, NaN where unknown, and the light's image if W shows where it is."""
+    """W as measured.
+
+    Attributes:
+        warp_map: W, NaN where unknown.
+        epipole: the light's image, if W shows where it is.
+        left_out: the number of a pass that does not agree with the others; None if they do.
+    """
 
     warp_map: WarpMap
     epipole: Epipole | None
+    left_out: int | None
 
 
 def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_progress) -> Solved:
@@ -40,15 +50,13 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     """
     height, width = passes[0].times.time.shape
     positions = identity_map(height, width)
-    windows = Windows.for_step(max(map(_usual_pace, passes)))
-    every = max(1, math.isqrt(height * width // _THIN))
-    thin = slice(None, None, every)
-    found = intersect([scan.part(thin, thin) for scan in passes], positions[thin, thin])
-    epipole = find_epipole(found.warp, found.error, positions[thin, thin])
+    epipole, left_out = _light(passes, positions)
+    used = [scan for number, scan in enumerate(passes) if number != left_out]
+    windows = Windows.for_step(max(map(_usual_pace, used)))
 
     def band(cut: tuple[slice, slice]) -> tuple[slice, WarpMap]:
         rows, inner = cut
-        own = [scan.part(rows) for scan in passes]
+        own = [scan.part(rows) for scan in used]
         here = positions[rows]
         if epipole is None:
             part = _in_two_dimensions(own, here, windows, inner)
@@ -62,7 +70,33 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     for done, (rows, part) in enumerate(ordered_map(band, cuts, jobs), start=1):
         whole.warp[rows], whole.error[rows] = part.warp, part.error
         progress(done, len(cuts))
-    return Solved(without_slips(whole), epipole)
+    return Solved(without_slips(whole), epipole, left_out)
+
+
+def _light(passes: list[Pass], positions: Float32) -> tuple[Epipole | None, int | None]:
+    """The light's image, and the number of the pass that was left out to find it, if one is wrong.
+
+    On the reference plane displacements are errors, which many of its pixels may have in common:
+    there nothing is looked for.
+    """
+    every = max(1, math.isqrt(positions.shape[0] * positions.shape[1] // _THIN))
+    thin = slice(None, None, every)
+    parts, here = [scan.part(thin, thin) for scan in passes], positions[thin, thin]
+    marked = [scan.plane for scan in parts if scan.plane is not None]
+    plane = np.any(marked, axis=0) if marked else np.zeros(here.shape[:2], bool)
+
+    def seen_by(some: list[Pass]) -> Epipole | None:
+        found = intersect(some, here)
+        return find_epipole(found.warp, np.where(plane, np.float32(np.inf), found.error), here)
+
+    everything = seen_by(parts)
+    missed = math.inf if everything is None else everything.miss
+    if len(parts) < 3 or missed <= _MISSED:
+        return everything, None
+    without = [seen_by(parts[:number] + parts[number + 1 :]) for number in range(len(parts))]
+    misses = [math.inf if epipole is None else epipole.miss for epipole in without]
+    best = int(np.argmin(misses))
+    return (without[best], best) if misses[best] < _WRONG * missed else (everything, None)
 
 
 def _usual_pace(scan: Pass) -> float:

@@ -192,7 +192,13 @@ class _Scans:
 
         The passes are gone afterwards: there may be a gigabyte of them.
         """
-        measured, epipole = solve(self.passes, run.jobs, run.progress)
+        measured, epipole, left_out = solve(self.passes, run.jobs, run.progress)
+        if left_out is not None:
+            logger.warning(
+                "%s: does not agree with the other sweeps, and is left out; sweep it again, at an"
+                " even pace, with a board whose shadow is wider than its steps",
+                self.folders[left_out],
+            )
         known = np.isfinite(measured.error)
         if known.mean() < _LEAST_KNOWN:
             raise ReshootError(
@@ -206,6 +212,7 @@ class _Scans:
                 f" ({', '.join(self.labels)}); sweep more slowly, with a straighter edge"
             )
         figures = _figures(self.labels, self.passes, measured, epipole)
+        figures["left_out"] = None if left_out is None else self.labels[left_out]
         self.passes.clear()
         return measured, figures
 

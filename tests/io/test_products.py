@@ -2,6 +2,7 @@
 
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,8 @@ def example_scan() -> Pass:
         for values in (random(HEIGHT, WIDTH, seed=3), random(HEIGHT, WIDTH, seed=4))
     )
     contrast = random(HEIGHT, WIDTH, seed=2)
-    return Pass(ShadowTimes(time, error, contrast, own, own_error), example_lines())
+    plane = random(HEIGHT, WIDTH, seed=5) > 0.5
+    return Pass(ShadowTimes(time, error, contrast, own, own_error), example_lines(), plane)
 
 
 @pytest.fixture
@@ -231,6 +233,12 @@ def test_a_scan_comes_back(scan_folder):
     for name in ("frame", "normal", "offset", "residual", "points"):
         np.testing.assert_array_equal(getattr(scan.lines, name), getattr(expected.lines, name))
     assert scan.lines.origin == expected.lines.origin
+    np.testing.assert_array_equal(scan.plane, expected.plane)
+
+
+def test_a_scan_need_not_say_what_was_marked(tmp_path):
+    write_scan(tmp_path, replace(example_scan(), plane=None), HEADER, MADE)
+    assert read_scan(tmp_path)[0].plane is None
 
 
 def test_a_scan_says_how_it_was_made(scan_folder):

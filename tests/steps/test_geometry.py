@@ -83,6 +83,22 @@ def test_w_is_found_to_a_fraction_of_a_pixel(scans: list[Path], tmp_path: Path, 
     assert np.abs(result.figures["light"]["at"]).max() > 1000
 
 
+def test_a_sweep_that_does_not_agree_with_the_others_is_left_out_and_named(
+    scans: list[Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bad, header, _ = read_scan(scans[0])
+    # On the block alone by up to two frames early or late.
+    bad.times.time[~SCENE.plane] += 2 * np.sin(IDENTITY[..., 1] / 3)[~SCENE.plane]
+    (tmp_path / "bad").mkdir()
+    write_scan(tmp_path / "bad", bad, header, {})
+    (result,) = warp([tmp_path / "bad", *scans[1:]], tmp_path / "map")
+    assert f"{tmp_path / 'bad'}: does not agree with the other sweeps" in caplog.text
+    assert result.figures["left_out"] == "bad"
+    found, _, _ = read_warp(tmp_path / "map" / WARP)
+    error = np.linalg.norm(found.warp - SCENE.warp, axis=-1)
+    assert np.median(error[np.isfinite(found.error) & ~SCENE.plane]) < 0.4
+
+
 def test_displacements_towards_no_one_place_are_told_of(
     scans: list[Path],
     tmp_path: Path,

@@ -3,6 +3,9 @@
 It is one number, or one for each row and channel where the light flickers or changes its colour.
 """
 
+from collections.abc import Sequence
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +24,12 @@ _WIDEST = 0.35
 _NOTHING = 0.004
 # What moves no time by which a shadow passes.
 _HARMLESS = 0.01
+# A white balance nearer to the reference's than this is its: what penumbrae take has a colour, too.
+_TINTED = 0.01
 # White balance is told by pixels that agree to so much, and are no brighter than this part of what
-# is brightest; by so many standard errors.
+# is brightest; by so many standard errors, and in so many rounds.
 _SAME_LIGHT, _UNCLIPPED, _SURE = 0.03, 0.95, 4.0
+_ROUNDS = 3
 # Into about so many areas a picture's longer side is divided.
 _AREAS = 160
 # At least this part of the pixels must agree, and so many.
@@ -72,21 +78,37 @@ def row_gains(image: Float32, reference: Float32, rows: Float64) -> Gains:
 
 def _tint(image: NDArray[np.floating], reference: Float32) -> Float64 | None:
     """By how much each channel is brighter than all together, (3,); None if none is."""
+    image = image.astype(np.float32, copy=False)
+    least = max(_LEAST_PART * image.shape[0] * image.shape[1], _LEAST_PIXELS)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        whole = np.log(channel_sum(image.astype(np.float32)) / channel_sum(reference))
-        same = np.abs(whole) < _SAME_LIGHT
-        if np.count_nonzero(same) < max(_LEAST_PART * same.size, _LEAST_PIXELS):
-            return None
-        clear = same & (image < _UNCLIPPED * np.nanmax(image, axis=(0, 1))).all(axis=-1)
-    now, then = image[clear].astype(np.float64), reference[clear].astype(np.float64)
-    if len(now) < max(_LEAST_PART * same.size, _LEAST_PIXELS) or (then.mean(axis=0) < 1e-2).any():
+        same = np.abs(channel_sum(image) / channel_sum(reference) - 1) < _SAME_LIGHT
+    if np.count_nonzero(same) < least or _largest(_means_ratio(image, reference, same)) < _TINTED:
         return None
-    # Of sums, as the ratios of single dark pixels are no more than noise.
-    tint = now.mean(axis=0) / then.mean(axis=0)
+    highest = [float(np.nanmax(channel)) for channel in cv2.split(image)]
+    clear = same & (cv2.inRange(image, (-np.inf,) * 3, tuple(_UNCLIPPED * v for v in highest)) > 0)
+    now, then = image[clear].astype(np.float64), reference[clear].astype(np.float64)
+    if len(now) < least or (then.mean(axis=0) < 1e-2).any():
+        return None
+    # Of differences, as the ratios of single dark pixels are no more than noise; and their medians,
+    # as a figure's colours may be among them.
+    tint = np.ones(3)
+    for _ in range(_ROUNDS):
+        tint += np.median(now - tint * then, axis=0) / then.mean(axis=0)
     tint /= np.exp(np.log(np.maximum(tint, 1e-6)).mean())
     error = (now - tint * then).std(axis=0) / (then.mean(axis=0) * np.sqrt(len(now)))
-    off = np.abs(np.log(np.maximum(tint, 1e-6))).max()
-    return None if off < max(_NOTHING, _SURE * error.max()) else tint
+    return None if _largest(tint) < max(_TINTED, _SURE * error.max()) else tint
+
+
+def _means_ratio(image: Float32, reference: Float32, where: NDArray[np.bool_]) -> Float64:
+    """The ratio of each channel's mean, (3,), by that of all together."""
+    now, then = (np.array(cv2.mean(i, where.view(np.uint8))[:3]) for i in (image, reference))
+    ratio = np.maximum(now, 1e-6) / np.maximum(then, 1e-6)
+    return np.asarray(ratio / np.exp(np.log(ratio).mean()))
+
+
+def _largest(ratio: Float64) -> float:
+    """The logarithm that is furthest from 0."""
+    return float(np.abs(np.log(ratio)).max())
 
 
 def is_one(gain: Gains) -> bool:
@@ -214,19 +236,31 @@ def common_reference(samples: list[Float32]) -> Float32:
     that most of them agree in lifts it again. Bands are as often light as dark in each row.
     """
     reference = _middle(samples)
-    rows = np.arange(len(reference), dtype=np.float64)
-    gains = [row_gains(sample, reference, rows) for sample in samples]
-    level = float(np.median([level_of(gain) for gain in gains]))
-    corrected = [
-        without_gain(sample, gain / level) for sample, gain in zip(samples, gains, strict=True)
-    ]
-    reference = _middle(corrected)
-    gains = [row_gains(sample, reference, rows) for sample in samples]
-    usual: Gains = float(np.median([level_of(gain) for gain in gains]))
+    # By levels alone first: where shade lasts that middle is darker, as if all frames had bands.
+    reference = _in_middle_light(samples, [frame_gain(sample, reference) for sample in samples])
+    gains = _row_gains_of_all(samples, reference)
     if not all(isinstance(gain, float) for gain in gains):
-        uneven = [np.log(gain / level_of(gain)) for gain in gains if not isinstance(gain, float)]
-        usual = usual * np.exp(np.sum(uneven, axis=0) / len(gains))
-    return without_gain(reference, 1 / usual).astype(np.float32, copy=False)
+        reference = _in_middle_light(samples, gains)
+        gains = _row_gains_of_all(samples, reference)
+    usual = float(np.median([level_of(gain) for gain in gains]))
+    uneven = [np.log(gain / level_of(gain)) for gain in gains if not isinstance(gain, float)]
+    if not uneven:
+        return reference * np.float32(usual)
+    bands_left = np.exp(np.sum(uneven, axis=0) / len(gains))
+    return without_gain(reference, 1 / (usual * bands_left)).astype(np.float32, copy=False)
+
+
+def _row_gains_of_all(samples: list[Float32], reference: Float32) -> list[Gains]:
+    rows = np.arange(len(reference), dtype=np.float64)
+    return [row_gains(sample, reference, rows) for sample in samples]
+
+
+def _in_middle_light(samples: list[Float32], gains: Sequence[Gains]) -> Float32:
+    """The median of frames without what tells their gains from the middle one."""
+    level = float(np.median([level_of(gain) for gain in gains]))
+    return _middle(
+        [without_gain(sample, gain / level) for sample, gain in zip(samples, gains, strict=True)]
+    )
 
 
 def _middle(samples: list[Float32]) -> Float32:

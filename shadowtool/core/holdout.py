@@ -95,6 +95,13 @@ def grid_step(width: int, height: int) -> int:
     return max(1, round(max(width, height) / _COLUMNS))
 
 
+def exposure_step(width: int, height: int) -> int:
+    """Every how many pixels exposure is looked at: fewer tell it than a figure's outline, unless
+    there are few."""
+    step = grid_step(width, height)
+    return step if step == 1 else 2 * step
+
+
 def on_grid(image: NDArray[np.floating], step: int) -> Float32:
     """The grid's pixels of a frame, (H, W, 3) to (h, w, 3) float32."""
     return to_float(np.ascontiguousarray(image[::step, ::step]))

@@ -17,7 +17,7 @@ from shadowtool.core.boxes import Box, around
 from shadowtool.core.camera_motion import Place, Vantage
 from shadowtool.core.exposure import Gains, level_of, of_rows, row_gains, unevenness, without_gain
 from shadowtool.core.half_floats import not_finite, to_float
-from shadowtool.core.holdout import grid_step, on_grid
+from shadowtool.core.holdout import exposure_step, on_grid
 from shadowtool.core.matting import (
     HIDDEN,
     MARGIN,
@@ -229,7 +229,7 @@ class _Scene:
                 np.where(unknown[..., np.newaxis], np.float32(0), plate) for plate in (lit, shadow)
             )
         gauge = shadow_beta.Gauge.of(Plates(lit, shadow), contrasts, never_shaded)
-        step = grid_step(lit.shape[1], lit.shape[0])
+        step = exposure_step(lit.shape[1], lit.shape[0])
         doubt, missing = np.broadcast_to(np.float32(0), unknown.shape), None
         if plates.shadow_frames is not None:
             doubt = np.where(plates.shadow_frames == 0, np.float32(_GUESSED), np.float32(0))

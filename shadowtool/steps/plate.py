@@ -26,6 +26,7 @@ from shadowtool.core.exposure import (
 from shadowtool.core.half_floats import not_finite, shortened
 from shadowtool.core.holdout import (
     Background,
+    exposure_step,
     figure_mask,
     find_background,
     full_size,
@@ -380,17 +381,14 @@ class _Take:
         known = self.known_gains.get(frame)
         if known is not None:
             return known
-        rows = np.arange(self.footage.header.height) / (self.step * self.thinning)
+        header = self.footage.header
+        rows = np.arange(header.height) / exposure_step(*header.size)
         return row_gains(self.sparse(grid), self.reference, rows)
-
-    @property
-    def thinning(self) -> int:
-        """Exposure takes fewer pixels than a figure's outline, unless there are few."""
-        return 1 if self.step == 1 else 2
 
     def sparse(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
         """What exposure takes of a grid."""
-        return grid[:: self.thinning, :: self.thinning]
+        thinning = exposure_step(*self.footage.header.size) // self.step
+        return grid[::thinning, ::thinning]
 
     def shown(self, frames: list[Frame], with_keys: bool, last: bool) -> Iterator[_Shown | None]:
         """Each frame in turn, None for those that are skipped.

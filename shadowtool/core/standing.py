@@ -147,19 +147,26 @@ class Sampled:
         off = _off_around(place, free, points, (first, second), self.lit)
         if off is None or min(off) > _GOES_ON * max(off):
             return None
-        ground, figure = (first, second) if off[0] < off[1] else (second, first)
-        changed = turned if off[0] < off[1] else ~turned
+        ground, figure, changed, then = (
+            (first, second, turned, pattern)
+            if off[0] < off[1]
+            else (second, first, ~turned, -pattern)
+        )
         if not changed.any() or _is_shade(ground[:, changed], figure[:, changed]):
             return None
         found[:, points[changed]] = ground[:, changed]
-        return pattern if off[0] < off[1] else -pattern
+        return then
 
     def _beside(self, found: Float32, then: NDArray[np.float64], place: Bool, free: Bool) -> None:
         """Uncover ground beside a place that was uncovered, too, if the same figure stood there."""
+        his, without = then <= -_THEN, then >= _THEN
+        if not his.any():
+            # Of whoever passes no two points show much at a time.
+            return
         near = cv2.dilate(place.view(np.uint8), _square(_BESIDE)).ravel() > 0
         near &= (found == self.lit).all(axis=0)
-        near &= self.on_line[then < -_THEN].mean(axis=0) >= _STILL
-        off = ~self.on_line & (then > _THEN)[:, np.newaxis] & near
+        near &= self.on_line[his].mean(axis=0) >= _STILL
+        off = ~self.on_line & without[:, np.newaxis] & near
         other = self._most_often(off, _LEAST_BESIDE)
         beside = other.often.reshape(self.size)
         for part in _places(beside):

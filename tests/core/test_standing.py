@@ -90,6 +90,18 @@ def test_lasting_shade_that_looks_like_what_is_around_is_no_ground() -> None:
     assert np.array_equal(given_lit.uncovered(), given_lit.lit)
 
 
+def test_somebody_who_only_passes_is_put_nowhere() -> None:
+    """Hardly two points show him at the same times; some have been taken for ground."""
+    lit = ground()
+    bars = [np.abs(COLUMNS - 20 - time) < 3 for time in range(SAMPLES)]
+    frames = [np.where(PLACE & bar[..., np.newaxis], COAT, lit) for bar in bars]
+    wrong = PLACE & (np.random.default_rng(1).random((*SIZE, 1)) < 0.3)
+    found = uncovered(frames, np.where(wrong, COAT, lit).astype(np.float32))
+    off = np.abs(np.log(found / lit)).max(axis=-1)
+    assert not (off > 0.1)[~wrong[..., 0]].any()
+    assert (off > 0.1).sum() < wrong.sum()
+
+
 def test_where_neither_goes_on_nothing_is_changed() -> None:
     lit = np.where(PLACE, np.float32([0.7, 0.1, 0.1]), ground()).astype(np.float32)
     figure = np.where(PLACE, COAT, lit)

@@ -26,10 +26,12 @@ _NOTHING = 0.004
 _HARMLESS = 0.01
 # A white balance nearer to the reference's than this is its: what penumbrae take has a colour, too.
 _TINTED = 0.01
-# White balance is told by pixels that agree to so much, and are no brighter than this part of what
-# is brightest; by so many standard errors, and in so many rounds.
-_SAME_LIGHT, _UNCLIPPED, _SURE = 0.03, 0.95, 4.0
+# White balance is told by pixels that agree to so much, and are no brighter than this part of the
+# brightest, but for so few; by so many standard errors, and in so many rounds.
+_SAME_LIGHT, _UNCLIPPED, _BRIGHTEST, _SURE = 0.03, 0.95, 0.995, 4.0
 _ROUNDS = 3
+# A take flickers if more than this part of its frames does.
+_MOSTLY = 0.5
 # Into about so many areas a picture's longer side is divided.
 _AREAS = 160
 # At least this part of the pixels must agree, and so many.
@@ -55,38 +57,55 @@ def frame_gain(image: Float32, reference: Float32) -> float:
     return 1.0 if centre is None or abs(centre) < _NOTHING else float(np.exp(centre))
 
 
-def row_gains(image: Float32, reference: Float32, rows: Float64) -> Gains:
+def row_gains(image: Float32, reference: Float32, rows: Float64, banded: bool) -> Gains:
     """By how much some rows of a frame are brighter, in each channel, than those of the reference.
 
     Args:
         image, reference: as of `frame_gain`.
         rows: (N,), places of rows, counted in those of the image.
+        banded: whether the take `flickers`, so that bands are to be looked for.
 
     Returns:
         `frame_gain`, if that is all; else (N, 3).
     """
     level = frame_gain(image, reference)
     own = np.arange(len(image), dtype=np.float64)
-    bands_of = band_gains(image, reference, level, np.concatenate([own, rows]))
-    flat = level if bands_of is None else level * bands_of[: len(own), np.newaxis] * np.ones(3)
-    tint = _tint(without_gain(image, flat), reference)
-    if bands_of is None and tint is None:
+    along = None
+    if banded:
+        along = band_gains(image, reference, level, np.concatenate([own, rows]))
+    flat = level if along is None else level * along[: len(own), np.newaxis] * np.ones(3)
+    tint = _tint(image, flat, reference)
+    if along is None and tint is None:
         return level
-    along = np.ones(len(rows)) if bands_of is None else bands_of[len(own) :]
-    return level * along[:, np.newaxis] * (np.ones(3) if tint is None else tint)
+    of_row = np.ones(len(rows)) if along is None else along[len(own) :]
+    return level * of_row[:, np.newaxis] * (np.ones(3) if tint is None else tint)
 
 
-def _tint(image: NDArray[np.floating], reference: Float32) -> Float64 | None:
-    """By how much each channel is brighter than all together, (3,); None if none is."""
-    image = image.astype(np.float32, copy=False)
+def flickers(samples: Sequence[Float32], reference: Float32) -> bool:
+    """Whether most frames of a sample, (h, w, 3) each, have bands of light and dark.
+
+    A lamp flickers in all frames; a penumbra from side to side, which looks alike, lies in some.
+    """
+    rows = np.zeros(0)
+    levels = [frame_gain(sample, reference) for sample in samples]
+    banded = [
+        band_gains(sample, reference, level, rows) is not None
+        for sample, level in zip(samples, levels, strict=True)
+    ]
+    return bool(banded) and sum(banded) > _MOSTLY * len(banded)
+
+
+def _tint(image: Float32, gain: Gains, reference: Float32) -> Float64 | None:
+    """By how much each channel is brighter than all together, besides a gain, (3,); None if none
+    is."""
+    level = np.asarray(without_gain(image, gain), np.float32)
     least = max(_LEAST_PART * image.shape[0] * image.shape[1], _LEAST_PIXELS)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        same = np.abs(channel_sum(image) / channel_sum(reference) - 1) < _SAME_LIGHT
-    if np.count_nonzero(same) < least or _largest(_means_ratio(image, reference, same)) < _TINTED:
+        same = np.abs(channel_sum(level) / channel_sum(reference) - 1) < _SAME_LIGHT
+    if np.count_nonzero(same) < least or _largest(_means_ratio(level, reference, same)) < _TINTED:
         return None
-    highest = [float(np.nanmax(channel)) for channel in cv2.split(image)]
-    clear = same & (cv2.inRange(image, (-np.inf,) * 3, tuple(_UNCLIPPED * v for v in highest)) > 0)
-    now, then = image[clear].astype(np.float64), reference[clear].astype(np.float64)
+    clear = same & _unclipped(image)
+    now, then = level[clear].astype(np.float64), reference[clear].astype(np.float64)
     if len(now) < least or (then.mean(axis=0) < 1e-2).any():
         return None
     # Of differences, as the ratios of single dark pixels are no more than noise; and their medians,
@@ -97,6 +116,17 @@ def _tint(image: NDArray[np.floating], reference: Float32) -> Float64 | None:
     tint /= np.exp(np.log(np.maximum(tint, 1e-6)).mean())
     error = (now - tint * then).std(axis=0) / (then.mean(axis=0) * np.sqrt(len(now)))
     return None if _largest(tint) < max(_TINTED, _SURE * error.max()) else tint
+
+
+def _unclipped(image: Float32) -> NDArray[np.bool_]:
+    """Where a picture as it was shot, (H, W, 3), is not next to the most that it holds; single
+    pixels may be broken."""
+    clear = np.ones(image.shape[:2], bool)
+    for channel in cv2.split(image):
+        values = channel[np.isfinite(channel)]
+        if values.size:
+            clear &= channel < _UNCLIPPED * np.quantile(values, _BRIGHTEST)
+    return clear
 
 
 def _means_ratio(image: Float32, reference: Float32, where: NDArray[np.bool_]) -> Float64:
@@ -132,6 +162,14 @@ def unevenness(gain: Gains) -> float:
         return 0.0
     along = gain.mean(axis=1)
     return float(np.abs(along / along.mean() - 1).max())
+
+
+def tint_of(gain: Gains) -> list[float]:
+    """By how much each channel is brighter than the frame altogether, three numbers."""
+    if isinstance(gain, float):
+        return [1.0, 1.0, 1.0]
+    channels = gain.mean(axis=0)
+    return [round(float(channel), 4) for channel in channels / channels.mean()]
 
 
 def _ratios(now: Float32, then: Float32) -> Float32:
@@ -233,26 +271,29 @@ def common_reference(samples: list[Float32]) -> Float32:
     """What most of a sample of frames show, with their own gains taken out; (h, w, 3).
 
     Its own exposure is that of the most frames: where long shade pulls the median down, the light
-    that most of them agree in lifts it again. Bands are as often light as dark in each row.
+    that most of them agree in lifts it again. Where a lamp flickers, each row is taken to be as
+    often lighter as darker.
     """
     reference = _middle(samples)
     # By levels alone first: where shade lasts that middle is darker, as if all frames had bands.
     reference = _in_middle_light(samples, [frame_gain(sample, reference) for sample in samples])
-    gains = _row_gains_of_all(samples, reference)
+    banded = flickers(samples, reference)
+    gains = _row_gains_of_all(samples, reference, banded)
     if not all(isinstance(gain, float) for gain in gains):
         reference = _in_middle_light(samples, gains)
-        gains = _row_gains_of_all(samples, reference)
+        gains = _row_gains_of_all(samples, reference, banded)
     usual = float(np.median([level_of(gain) for gain in gains]))
-    uneven = [np.log(gain / level_of(gain)) for gain in gains if not isinstance(gain, float)]
-    if not uneven:
+    if all(isinstance(gain, float) for gain in gains):
         return reference * np.float32(usual)
-    bands_left = np.exp(np.sum(uneven, axis=0) / len(gains))
-    return without_gain(reference, 1 / (usual * bands_left)).astype(np.float32, copy=False)
+    uneven = [np.log(np.ones((len(reference), 3)) * gain / level_of(gain)) for gain in gains]
+    rows = np.mean(uneven, axis=(0, 2))[:, np.newaxis]
+    tint = np.median(np.mean(uneven, axis=1), axis=0)
+    return without_gain(reference, np.exp(-rows - tint) / usual).astype(np.float32, copy=False)
 
 
-def _row_gains_of_all(samples: list[Float32], reference: Float32) -> list[Gains]:
+def _row_gains_of_all(samples: list[Float32], reference: Float32, banded: bool) -> list[Gains]:
     rows = np.arange(len(reference), dtype=np.float64)
-    return [row_gains(sample, reference, rows) for sample in samples]
+    return [row_gains(sample, reference, rows, banded) for sample in samples]
 
 
 def _in_middle_light(samples: list[Float32], gains: Sequence[Gains]) -> Float32:
@@ -284,7 +325,8 @@ def without_gain(image: NDArray[np.floating], gain: Gains) -> NDArray[np.floatin
     else:
         inverse = (1 / gain).astype(np.float32)[:, np.newaxis]
     if image.dtype != np.float16:
-        return image.astype(np.float32) * inverse
+        with np.errstate(over="ignore"):
+            return image.astype(np.float32) * inverse
     corrected = np.empty_like(image)
     for rows in bands(image.shape):
         corrected[rows] = rounded(to_float(image[rows]) * inverse[rows])

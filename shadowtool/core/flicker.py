@@ -8,10 +8,13 @@ from shadowtool.core.bands import channel_sum
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-# Logarithms of ratios further from 0 are shadow. A frame is cut into so many strips, each of them
-# at least so many pixels wide; a row of a strip is known if half of it is, a row if so many strips
-# are, and a frame if this part of its rows is.
-_WIDEST, _STRIPS, _NARROWEST, _LEAST_STRIPS, _LEAST_ROWS = 0.2, 6, 4, 3, 0.7
+# Logarithms of ratios further from 0 are shadow.
+_WIDEST = 0.2
+# A frame is cut into so many strips, each of them at least so many pixels wide.
+_STRIPS, _NARROWEST = 6, 4
+# A row of a strip is known if half of it is, a row if so many strips are, and a frame if this part
+# of its rows is.
+_LEAST_STRIPS, _LEAST_ROWS = 3, 0.7
 # Bands are two waves, one twice as fast, of which the slower goes through the frame so many times;
 # found in steps; and no faster than one in so many rows.
 _SLOWEST, _FASTEST, _STEP, _ROWS_A_WAVE = 0.8, 20.0, 0.1, 6
@@ -70,7 +73,9 @@ def band_gains(image: Float32, reference: Float32, level: float, rows: Float64) 
     told = seen.sum(axis=0) > len(places) / 2
     if np.count_nonzero(told) < _LEAST_STRIPS or np.median(np.abs(strength[told] - 1)) > _ALIKE:
         return None
-    return np.asarray(np.exp((_waves(cycles[best : best + 1], rows)[0] @ weights[best])[:, 0]))
+    wanted = (_waves(cycles[best : best + 1], rows)[0] @ weights[best])[:, 0]
+    # Of rows that are not known no more is said than of those that are.
+    return np.asarray(np.exp(np.clip(wanted, bands.min(), bands.max())))
 
 
 def _of_strips(image: Float32, reference: Float32, level: float) -> Float64 | None:

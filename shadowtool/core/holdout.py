@@ -102,6 +102,11 @@ def exposure_step(width: int, height: int) -> int:
     return step if step == 1 else 2 * step
 
 
+def exposure_rows(width: int, height: int) -> NDArray[np.float64]:
+    """Where a picture's rows lie among those that exposure is looked at in, (H,)."""
+    return np.arange(height) / exposure_step(width, height)
+
+
 def on_grid(image: NDArray[np.floating], step: int) -> Float32:
     """The grid's pixels of a frame, (H, W, 3) to (h, w, 3) float32."""
     return to_float(np.ascontiguousarray(image[::step, ::step]))

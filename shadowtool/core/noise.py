@@ -217,17 +217,18 @@ def noise_levels(samples: Mapping[int, Float32]) -> list[NoiseLevel]:
 
 
 def _in_one_light(samples: Mapping[int, Float32]) -> Mapping[int, Float32]:
-    """Samples without changes of the light, if it changes from one frame to the next; all of them
-    in that of the first."""
+    """Samples without changes of the light, if it changes from most frames to the next; all of
+    them in that of the first."""
     rows = np.arange(max((len(image) for image in samples.values()), default=0), dtype=np.float64)
 
     def gain(image: Float32, other: Float32) -> Gains:
         with np.errstate(invalid="ignore", over="ignore"):
-            return row_gains(image, other, rows)
+            return row_gains(image, other, rows, banded=True)
 
     pairs = ((samples[a], samples[a + 1]) for a in samples if a % 2 == 0 and a + 1 in samples)
     gains = [gain(second, first) for first, second in pairs]
-    if all(isinstance(own, float) and abs(own - 1) < _STEADY for own in gains):
+    steady = [isinstance(own, float) and abs(own - 1) < _STEADY for own in gains]
+    if 2 * sum(steady) >= len(steady):
         return samples
     first = samples[min(samples)]
     return {

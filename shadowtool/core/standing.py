@@ -37,6 +37,8 @@ _MOST_OFF, _GOES_ON = 1.5, 0.8
 _TOGETHER, _ROUNDS = 0.7, 4
 # Shade has everywhere the same part of the light, but for so much, a logarithm.
 _SHADE_SCATTER = 0.15
+# More than this part of a place's points is most of them.
+_MOSTLY = 0.5
 # At some time a place was the one thing if this part of it was that, more than the other.
 _THEN = 0.5
 # Up to so many points around a place the same figure is what was seen in this part of his time.
@@ -154,8 +156,21 @@ class Sampled:
         )
         if not changed.any() or _is_shade(ground[:, changed], figure[:, changed]):
             return None
+        mistaken = points[changed]
+        if self._passed(self.on_line[:, mistaken], other.seen[:, mistaken]):
+            return None
         found[:, points[changed]] = ground[:, changed]
         return then
+
+    @staticmethod
+    def _passed(ground: Bool, other: Bool) -> bool:
+        """Whether most points, (T, N), showed what is taken for ground both before and after the
+        other thing: that then came by and went, however well it goes with what is around."""
+        begun, ended = (
+            np.argmax(one, axis=0) < np.argmax(two, axis=0)
+            for one, two in ((ground, other), (ground[::-1], other[::-1]))
+        )
+        return bool((begun & ended).mean() > _MOSTLY)
 
     def _beside(self, found: Float32, then: NDArray[np.float64], place: Bool, free: Bool) -> None:
         """Uncover ground beside a place that was uncovered, too, if the same figure stood there."""

@@ -34,10 +34,12 @@ _IN_PLACE = ("plate", "matte")
 
 
 class Survey(NamedTuple):
-    """What a few frames spread over a take tell of it: its noise, and their rows as of `strips`."""
+    """What a few frames spread over a take tell of it: its noise, their rows as of `strips`, and
+    themselves, thinned."""
 
     noise: NoiseModel
     rows: list[Float32]
+    thinned: list[Float32]
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Footage:
             if sample is not None:
                 samples[number], own_rows = sample
                 rows.append(own_rows)
-        return Survey(noise_model(noise_levels(samples)), rows)
+        return Survey(noise_model(noise_levels(samples)), rows, list(samples.values()))
 
     def _sample(self, frame: Frame) -> tuple[Float32, Float32] | None:
         try:
@@ -179,8 +181,8 @@ def say_flickers(footage: Footage, bands: float) -> None:
     """
     if bands > 0:
         logger.warning(
-            "%s: the light flickers, in bands that differ by up to %.1f%%; they are taken out, but"
-            " expose for a whole number of its periods, 1/50 s or 1/60 s as the mains has it",
+            "%s: the light flickers, in bands of up to %.1f%% more light or less; they are taken"
+            " out, but expose for whole periods of the mains, 1/50 s or 1/60 s",
             footage.sequence.pattern,
             100 * bands,
         )

@@ -15,9 +15,18 @@ from shadowtool.core.backdrop import Backdrop, missing_shade
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.boxes import Box, around
 from shadowtool.core.camera_motion import Place, Vantage
-from shadowtool.core.exposure import Gains, level_of, of_rows, row_gains, unevenness, without_gain
+from shadowtool.core.exposure import (
+    Gains,
+    flickers,
+    level_of,
+    of_rows,
+    row_gains,
+    tint_of,
+    unevenness,
+    without_gain,
+)
 from shadowtool.core.half_floats import not_finite, to_float
-from shadowtool.core.holdout import exposure_step, on_grid
+from shadowtool.core.holdout import exposure_rows, exposure_step, on_grid
 from shadowtool.core.matting import (
     HIDDEN,
     MARGIN,
@@ -26,7 +35,7 @@ from shadowtool.core.matting import (
     pull_figure,
     without_figure,
 )
-from shadowtool.core.noise import NoiseModel
+from shadowtool.core.noise import NoiseModel, thin
 from shadowtool.core.plates import Plates
 from shadowtool.core.trembling import UNSTEADY, off_place, strips
 from shadowtool.core.trimap import FIGURE
@@ -126,11 +135,14 @@ def matte(
     if "alpha" in given:
         pattern = footage.sequence.pattern
         require_frames(given["alpha"], frames, footage.header, pattern, run.missing)
-    noise, rows = footage.survey(run.jobs)
-    off = off_place(strips(stored.plates.lit[..., 1]), rows) if steady == "auto" else 0.0
+    lit = stored.plates.lit
+    survey = footage.survey(run.jobs)
+    off = off_place(strips(lit[..., 1]), survey.rows) if steady == "auto" else 0.0
     if off > UNSTEADY:
-        footage = replace(footage, vantage=Vantage.of(stored.plates.lit))
-        noise = footage.survey(run.jobs).noise
+        footage = replace(footage, vantage=Vantage.of(lit))
+        survey = footage.survey(run.jobs)
+    noise, banded = survey.noise, gain == "auto" and flickers(survey.thinned, thin(lit))
+    del lit, survey
     recipe = Recipe(
         "matte",
         {
@@ -161,6 +173,7 @@ def matte(
         clamp,
         fill,
         gain,
+        banded,
         output,
     )
     shared = [stored.fingerprint, *given]
@@ -300,6 +313,7 @@ class _Take:
     clamp: bool
     fill: Fill
     gain: Gain
+    banded: bool
     output: Path
 
     def products(self, frame: Frame) -> list[Path]:
@@ -333,6 +347,7 @@ class _Take:
             "not_finite": 0 if shown.bad is None else int(np.count_nonzero(shown.bad)),
             "gain": round(level_of(shown.gain), 6),
             "bands": round(unevenness(shown.gain), 4),
+            "tint": tint_of(shown.gain),
             "moved": round(float(np.hypot(*shown.moved)), 3),
         }
         marked, header = with_figures(provenance, figures), shown.header
@@ -376,10 +391,10 @@ class _Take:
         bad = not_finite(light)
         gain: Gains = 1.0
         if self.gain == "auto":
-            step = self.scene.step
-            rows = np.arange(stored.header.height) / step
+            grid = on_grid(light, self.scene.step)
+            rows = exposure_rows(*stored.header.size)
             with np.errstate(invalid="ignore"):
-                gain = row_gains(on_grid(light, step), self.scene.reference, rows)
+                gain = row_gains(grid, self.scene.reference, rows, self.banded)
         return _Shown(light, stored.header, bad, gain, place)
 
     def _figure(self, frame: Frame, shown: _Shown) -> _Figure:

@@ -16,16 +16,19 @@ from shadowtool.core.camera_motion import Place
 from shadowtool.core.exposure import (
     Gains,
     common_reference,
+    flickers,
     is_one,
     level_of,
     of_rows,
     row_gains,
+    tint_of,
     unevenness,
     without_gain,
 )
 from shadowtool.core.half_floats import not_finite, shortened
 from shadowtool.core.holdout import (
     Background,
+    exposure_rows,
     exposure_step,
     figure_mask,
     find_background,
@@ -328,11 +331,13 @@ class _Take:
         steady: whether frames are moved to one place if the camera trembles.
         card: whether it is that of a card waved over a scene; None while that isn't known.
         reference: what exposure is measured against, on its grid; None until it is known.
+        flickers: whether its light does.
         kept: sampled frames that need not be read again.
         known_gains: of the sampled frames.
         masks: their automatic holdouts on the grid, once they are known.
         gains: of the frames that were used, where they are not 1.
         bands: by what part their rows differ in brightness, at most.
+        tints: by how much their channels are brighter than they are, where that is not 1.
         trembling: by how much the camera's place varies, pixels; None where it wasn't measured.
         not_finite: how many of their pixels are NaN or infinite.
         folder: where the automatic one is written.
@@ -349,11 +354,13 @@ class _Take:
     recipe: Recipe
     background: Background | None = None
     reference: NDArray[np.float32] | None = None
+    flickers: bool = False
     kept: dict[Frame, _Kept] = field(default_factory=dict)
     known_gains: dict[Frame, Gains] = field(default_factory=dict)
     masks: dict[Frame, Bool] = field(default_factory=dict)
     gains: dict[str, float] = field(default_factory=dict)
     bands: float = 0.0
+    tints: dict[str, list[float]] = field(default_factory=dict)
     trembling: float | None = None
     not_finite: dict[str, int] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
@@ -381,9 +388,8 @@ class _Take:
         known = self.known_gains.get(frame)
         if known is not None:
             return known
-        header = self.footage.header
-        rows = np.arange(header.height) / exposure_step(*header.size)
-        return row_gains(self.sparse(grid), self.reference, rows)
+        rows = exposure_rows(*self.footage.header.size)
+        return row_gains(self.sparse(grid), self.reference, rows, self.flickers)
 
     def sparse(self, grid: NDArray[np.float32]) -> NDArray[np.float32]:
         """What exposure takes of a grid."""
@@ -464,6 +470,8 @@ class _Take:
                 if not is_one(item.gain):
                     self.gains[str(frames[position])] = round(level_of(item.gain), 6)
                     self.bands = max(self.bands, round(unevenness(item.gain), 4))
+                    if (tint := tint_of(item.gain)) != [1, 1, 1]:
+                        self.tints[str(frames[position])] = tint
                 yield position, item
             self.run.progress(begun + position + 1, total)
         if not self.used:
@@ -526,7 +534,9 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
             # Somebody large moved, not the camera.
             take.trembling = 0.0
     if take.level and apart:
-        take.reference = common_reference([take.sparse(grids[frame]) for frame in apart])
+        sparse = [take.sparse(grids[frame]) for frame in apart]
+        take.reference = common_reference(sparse)
+        take.flickers = flickers(sparse, take.reference)
     gains = {frame: take.gain(frame, grid) for frame, grid in grids.items()}
     take.known_gains = gains
     # Where a figure is held out by what was given it is a source.
@@ -608,6 +618,7 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         figures: Figures = {
             "gains": take.gains,
             "bands": take.bands,
+            "tints": take.tints,
             "shaded": round(float(shaded.mean()), 4),
             "own_evidence": round(float(completed.own[seen].mean()), 4) if seen.any() else 0.0,
             "read_as": reading if shaded.any() else "a scene without shadow",

@@ -316,7 +316,7 @@ CONTRACTS = {
         lambda r, a: r == 1.0,
     ),
     "row_gains": Contract(
-        lambda a, b: exposure.row_gains(a, b, np.arange(len(a), dtype=float)),
+        lambda a, b: exposure.row_gains(a, b, np.arange(len(a), dtype=float), True),
         lambda h, w: st.tuples(picture(h, w), picture(h, w)),
         lambda r, a, b: np.shape(r) in ((), (len(a), 3)) and np.all((r > 0.5) & (r < 2)),
     ),

@@ -6,12 +6,14 @@ from hypothesis import strategies as st
 from shadowtool.core.exposure import (
     RunningGain,
     common_reference,
+    flickers,
     frame_gain,
     is_one,
     level_of,
     of_rows,
     row_gains,
     sampled_areas,
+    tint_of,
     unevenness,
     without_gain,
 )
@@ -78,15 +80,18 @@ def test_bands_and_tints_are_found_beside_the_level(
     bands: np.ndarray, tint: np.ndarray, level: float
 ) -> None:
     true = level * bands[:, None] * tint
-    gains = row_gains(crossed(80, 45, 3) * true[:, None].astype(np.float32), SCENE.lit, ROWS)
+    gains = row_gains(crossed(80, 45, 3) * true[:, None].astype(np.float32), SCENE.lit, ROWS, True)
     if np.ptp(true) == 0:
         assert gains == frame_gain(crossed(80, 45, 3) * np.float32(level), SCENE.lit)
     assert np.broadcast_to(gains, true.shape) == pytest.approx(true, abs=0.012)
 
 
-def test_a_channel_that_is_clipped_has_no_tint() -> None:
+@pytest.mark.parametrize("broken", [None, 3.0, np.inf, np.nan])
+def test_a_channel_that_is_clipped_has_no_tint(broken: float | None) -> None:
     brighter = np.minimum(crossed(80, 45, 1) * np.float32([1.08] * 3), np.float32([0.45, 2, 2]))
-    assert isinstance(row_gains(brighter, np.minimum(SCENE.lit, [0.45, 2, 2]), ROWS), float)
+    if broken is not None:
+        brighter[0, 0] = broken
+    assert isinstance(row_gains(brighter, np.minimum(SCENE.lit, [0.45, 2, 2]), ROWS, True), float)
 
 
 def test_gains_of_rows_are_taken_out_of_them() -> None:
@@ -105,18 +110,48 @@ def test_what_gains_amount_to() -> None:
     gains = 0.9 * BANDS[:, None] * TINT
     assert level_of(gains) == pytest.approx(0.9 * BANDS.mean() * TINT.mean())
     assert unevenness(gains) == pytest.approx(0.05, rel=0.05)
+    assert tint_of(gains) == pytest.approx(TINT / TINT.mean(), abs=1e-4)
+    assert tint_of(0.9) == [1, 1, 1]
     assert (level_of(0.9), unevenness(0.9), is_one(0.9)) == (0.9, 0, False)
     assert is_one(1.0) and not is_one(np.ones((4, 3)))
 
 
+def flickering_take() -> list[np.ndarray]:
+    angles = [2 * np.pi * (1.7 * ROWS / SCENE.height + 0.37 * number) for number in range(24)]
+    return [
+        (frame * (1 + 0.06 * np.sin(angle))[:, None, None]).astype(np.float32)
+        for frame, angle in zip(take(), angles, strict=True)
+    ]
+
+
+def card_take(soft: float = 50) -> list[np.ndarray]:
+    """A card with a soft edge from side to side comes down half of the picture and goes again."""
+    edges = 0.6 * SCENE.height * np.sin(np.pi * np.arange(24) / 23)
+    betas = [np.clip((ROWS - edge) / soft + 0.5, 0, 1)[:, None, None] for edge in edges]
+    images = [SCENE.shadow + beta * (SCENE.lit - SCENE.shadow) for beta in betas]
+    return [SCENE.noisy(image, number) for number, image in enumerate(images)]
+
+
 def test_the_reference_of_a_flickering_take_has_no_bands() -> None:
-    samples = []
-    for number, frame in enumerate(take()):
-        angle = 2 * np.pi * (1.7 * ROWS / SCENE.height + 0.37 * number)
-        samples.append((frame * (1 + 0.06 * np.sin(angle))[:, None, None]).astype(np.float32))
-    reference = common_reference(samples)
+    reference = common_reference(flickering_take())
     rows = np.median(np.log(reference / SCENE.lit), axis=(1, 2))
     assert np.abs(rows).max() < 0.01
+
+
+def test_a_take_flickers_if_most_of_its_frames_do() -> None:
+    assert flickers(flickering_take(), SCENE.lit)
+    assert not flickers(take(), SCENE.lit)
+    assert not flickers([*take()[:14], *flickering_take()[14:]], SCENE.lit)
+    assert not flickers([], SCENE.lit)
+
+
+@pytest.mark.parametrize("soft", [30, 40, 50, 60])
+def test_penumbrae_from_side_to_side_are_no_flicker(soft: float) -> None:
+    samples = card_take(soft)
+    assert not flickers(samples, SCENE.lit)
+    reference = common_reference(samples)
+    # Where the card hardly ever comes.
+    assert np.median(reference[-15:] / SCENE.lit[-15:]) == pytest.approx(1, abs=0.01)
 
 
 def test_what_is_unknown_is_passed_over() -> None:

@@ -102,6 +102,19 @@ def test_somebody_who_only_passes_is_put_nowhere() -> None:
     assert (off > 0.1).sum() < wrong.sum()
 
 
+@pytest.mark.parametrize("grain", [0.1, 0.25, 0.4])
+def test_somebody_who_passes_in_the_grounds_mean_colour_is_no_ground(grain: float) -> None:
+    """His plain coat goes better with what is around than textured ground does."""
+    lit = ground(grain)
+    coat = np.broadcast_to(np.float32([0.44, 0.4, 0.32]), lit.shape)
+    places = [
+        np.hypot((COLUMNS - 4 - 3 * time) / 12, (ROWS - 20) / 14) < 1 for time in range(SAMPLES)
+    ]
+    frames = [np.where(place[..., np.newaxis], coat, lit) for place in places]
+    known = sampled(frames, lit)
+    assert np.array_equal(known.uncovered(), known.lit)
+
+
 def test_where_neither_goes_on_nothing_is_changed() -> None:
     lit = np.where(PLACE, np.float32([0.7, 0.1, 0.1]), ground()).astype(np.float32)
     figure = np.where(PLACE, COAT, lit)

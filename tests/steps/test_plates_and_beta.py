@@ -461,6 +461,25 @@ def test_what_flickers_is_level_and_is_said(
     assert np.abs(off).mean() > 0.01
 
 
+def test_a_white_balance_that_drifts_is_level_and_recorded(
+    level_plates: Path, tmp_path: Path
+) -> None:
+    tints = {
+        n: np.float16([1.05, 1, 0.96]) if n % 3 == 0 else np.float16([1, 1, 1]) for n in NUMBERS
+    }
+    take = write_frames(tmp_path / "drifting", (picture(n) * tints[n] for n in NUMBERS))
+    plate(take, tmp_path / "plates", holdout="none", read_as="plane")
+    matte(take, tmp_path / "matte", plates=tmp_path / "plates", only="beta")
+    found, plain = plates_of(tmp_path / "plates"), plates_of(level_plates / "plain")
+    assert error(found.lit, plain.lit).mean() < 0.005
+    drifted = [n for n in NUMBERS if n % 3 == 0]
+    assert set(figures_of(tmp_path / "plates")["tints"]) == {str(n) for n in drifted}
+    rows = json.loads((tmp_path / "matte" / MANIFEST).read_text())["frames"]
+    for n in NUMBERS:
+        expected = tints[n].astype(float) / tints[n].astype(float).mean()
+        assert rows[str(n)]["tint"] == pytest.approx(expected, abs=0.006)
+
+
 def test_a_steady_take_has_no_gains(takes: Path, level_plates: Path, tmp_path: Path) -> None:
     plate(takes / "plain", tmp_path / "none", holdout="none", read_as="plane", gain="none")
     assert figures_of(level_plates / "plain")["gains"] == {}

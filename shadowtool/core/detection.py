@@ -25,10 +25,11 @@ Bool = NDArray[np.bool_]
 # first two, and from L. A figure's colours are spread over so many times more of what a pixel can
 # be.
 _NEAR_LINE, _NEAR_LIT = (2.5, 5.0), 9.0
-# The first is for noise, of which hardly any mean over so many pixels squared of lit ground is so
-# many times as large as the median; the larger these are, as in compressed footage, the nearer it
-# is to the second. Of fewer pixels nothing is told.
-_MEAN, _TAIL, _HARDLY_ANY, _LEAST_LIT = 5, 1.6, 0.95, 500
+# Which of these it is lit ground tells, by the means of its squared distances over so many pixels
+# squared. Noise averages out: but for the last part no mean is so many times the median, and the
+# first holds. The larger these are, as where a codec left blocks, the nearer it is to the second.
+# Of fewer lit pixels nothing is told.
+_MEAN, _TAIL, _NEARLY_ALL, _LEAST_LIT = 5, 1.6, 0.95, 500
 # No single pixel's colour says more than this, and no step between two.
 _MOST, _MOST_TEXTURE = 8.0, 6.0
 # A trimap from another frame is worth as much: it decides where colours don't.
@@ -153,7 +154,7 @@ def _near_line(nearest: Nearest, unknown: Bool) -> float:
     least, most = _NEAR_LINE
     if off.size < _LEAST_LIT:
         return most
-    middle, tail = np.quantile(off, (0.5, _HARDLY_ANY))
+    middle, tail = np.quantile(off, (0.5, _NEARLY_ALL))
     return float(np.clip(least * tail / max(_TAIL * middle, 1e-6), least, most))
 
 

@@ -20,8 +20,10 @@ Float32 = NDArray[np.float32]
 # About so many pixels are enough to find the light's image.
 _THIN = 200_000
 # If displacements miss the light's image by more than this, pixels, and without one of the passes
-# by less than this part of that, it is that pass that is wrong.
+# by less than this part of that, and of what they do without any other, that pass is wrong.
 _MISSED, _WRONG = 0.5, 0.4
+# The plane is what more than this part of the passes have marked.
+_MOSTLY = 0.5
 
 
 class Solved(NamedTuple):
@@ -42,7 +44,8 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     """Intersect the lines of all passes, first for the light's image, then for W towards it.
 
     Where nothing stands on the plane, or where the displacements agree on no light's image, W is
-    the intersection in two dimensions.
+    the intersection in two dimensions. A pass that does not agree with two others or more is used
+    only where these say nothing.
 
     Args:
         passes: two or more, all of one size.
@@ -54,14 +57,19 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     used = [scan for number, scan in enumerate(passes) if number != left_out]
     windows = Windows.for_step(max(map(_usual_pace, used)))
 
+    def measured(some: list[Pass], rows: slice, inner: slice) -> WarpMap:
+        own, here = [scan.part(rows) for scan in some], positions[rows]
+        if epipole is None:
+            return _in_two_dimensions(own, here, windows, inner)
+        return _towards(epipole, own, here, windows, inner)
+
     def band(cut: tuple[slice, slice]) -> tuple[slice, WarpMap]:
         rows, inner = cut
-        own = [scan.part(rows) for scan in used]
-        here = positions[rows]
-        if epipole is None:
-            part = _in_two_dimensions(own, here, windows, inner)
-        else:
-            part = _towards(epipole, own, here, windows, inner)
+        part = measured(used, rows, inner)
+        if left_out is not None:
+            # Where the others say nothing it is better than nothing.
+            unknown, other = np.isinf(part.error), measured(passes, rows, inner)
+            part.warp[unknown], part.error[unknown] = other.warp[unknown], other.error[unknown]
         return slice(rows.start + inner.start, rows.start + inner.stop), part
 
     whole = WarpMap(np.empty((height, width, 2), np.float32), np.empty((height, width), np.float32))
@@ -83,20 +91,30 @@ def _light(passes: list[Pass], positions: Float32) -> tuple[Epipole | None, int 
     thin = slice(None, None, every)
     parts, here = [scan.part(thin, thin) for scan in passes], positions[thin, thin]
     marked = [scan.plane for scan in parts if scan.plane is not None]
-    plane = np.any(marked, axis=0) if marked else np.zeros(here.shape[:2], bool)
+    plane = np.zeros(here.shape[:2], bool)
+    if marked:
+        plane = np.mean(marked, axis=0) > _MOSTLY
 
     def seen_by(some: list[Pass]) -> Epipole | None:
         found = intersect(some, here)
-        return find_epipole(found.warp, np.where(plane, np.float32(np.inf), found.error), here)
+        off_plane = np.where(plane, np.float32(np.inf), found.error)
+        epipole = find_epipole(found.warp, off_plane, here)
+        # A mark may be drawn over all that stands on the plane.
+        return epipole or (find_epipole(found.warp, found.error, here) if marked else None)
 
     everything = seen_by(parts)
-    missed = math.inf if everything is None else everything.miss
-    if len(parts) < 3 or missed <= _MISSED:
+    if len(parts) < 3 or (everything is not None and everything.miss <= _MISSED):
         return everything, None
     without = [seen_by(parts[:number] + parts[number + 1 :]) for number in range(len(parts))]
     misses = [math.inf if epipole is None else epipole.miss for epipole in without]
     best = int(np.argmin(misses))
-    return (without[best], best) if misses[best] < _WRONG * missed else (everything, None)
+    # Two passes have a point of their own whatever they are, if now and then: one is wrong only if
+    # with it all is, and without it all is well.
+    worse = min(misses[:best] + misses[best + 1 :])
+    if everything is not None:
+        worse = min(worse, everything.miss)
+    agreed = misses[best] < _WRONG * worse and (everything is not None or misses[best] <= _MISSED)
+    return (without[best], best) if agreed else (everything, None)
 
 
 def _usual_pace(scan: Pass) -> float:

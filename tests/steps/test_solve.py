@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -64,6 +65,41 @@ def test_a_pass_that_does_not_agree_with_the_others_is_left_out(bad: int) -> Non
     solved = solve(passes)
     assert solved.left_out == bad
     assert off_block(solved) < 0.2
+
+
+def test_where_the_others_say_nothing_a_pass_that_was_left_out_is_used() -> None:
+    waves = 8 * np.sin(HERE[..., 1:] / 3) * np.float32([1, 0.3])
+    wrong = np.where(SCENE.plane[..., np.newaxis], SCENE.warp, SCENE.warp + waves)
+    passes = [
+        pass_of(sweep, wrong if number == 0 else SCENE.warp) for number, sweep in enumerate(SWEEPS)
+    ]
+    passes[1].times.time[:, 110:] = passes[1].times.own_time[:, 110:] = np.nan
+    solved = solve(passes)
+    assert solved.left_out == 0
+    assert np.isfinite(solved.warp_map.error[:, 120:150]).mean() > 0.95
+    assert off_block(solved) < 0.2
+
+
+def test_a_mark_that_is_drawn_over_everything_hides_no_light() -> None:
+    passes = [pass_of(sweep, SCENE.warp) for sweep in SWEEPS]
+    everything = np.ones_like(SCENE.plane)
+    solved = solve([replace(scan, plane=everything) for scan in passes])
+    assert solved.epipole is not None
+    assert off_block(solved) < 0.2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_errors_of_all_passes_are_no_ones_fault(seed: int) -> None:
+    """Flat ground that nobody marked, and errors that neighbours have in common."""
+    rng = np.random.default_rng(seed)
+    passes = []
+    for sweep in SWEEPS:
+        scan = pass_of(sweep, HERE, marked=False)
+        errors = cv2.GaussianBlur(rng.normal(size=SCENE.plane.shape), (0, 0), 6)
+        for times in (scan.times.time, scan.times.own_time):
+            times += (0.5 * errors / errors.std()).astype(np.float32)
+        passes.append(scan)
+    assert solve(passes).left_out is None
 
 
 def test_passes_that_agree_are_all_used() -> None:

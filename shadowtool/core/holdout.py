@@ -143,9 +143,9 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     ascending = np.argsort(stack.sum(axis=1), axis=0)
     ratio = _common_ratio(stack, ascending, noise, shape[:2])
     lit = _most_supported(stack, ascending, weighed, ratio)
-    lit = Sampled(stack, weighed, lit, ratio, shape[:2]).uncovered()
+    known = Sampled(stack, weighed, lit, ratio, shape[:2]).uncovered()
+    lit, on_line = known.lit, list(known.on_line)
     shadow = lit * ratio
-    on_line = [_on_line(sample, lit, shadow) for sample in weighed]
     under_card = _under_a_card(stack, on_line, lit)
     shadow = _deeper_shade(stack, on_line, lit, shadow, shape[:2])
     lit, shadow = (np.ascontiguousarray(plate.T).reshape(shape) for plate in (lit, shadow))

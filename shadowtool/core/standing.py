@@ -5,7 +5,7 @@ the place's outline: a figure ends there.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -82,8 +82,9 @@ class Sampled:
         """(T, N), which samples what is taken for ground explains, in light or in shade."""
         return _explained(self.weighed, self.lit, self.ratio)
 
-    def uncovered(self) -> Float32:
-        """Lit colours, (3, N), of ground also where somebody who stood for long was taken for it.
+    def uncovered(self) -> "Sampled":
+        """The same with ``lit`` that of ground also where somebody who stood for long was taken for
+        it; itself if nobody was.
 
         A surface in shade is told from somebody dark by what it has of the light, which is the
         same all over it.
@@ -96,7 +97,7 @@ class Sampled:
             then = self._uncover(found, other, place, ~places)
             if then is not None:
                 self._beside(found, then, place, ~places)
-        return found
+        return self if np.array_equal(found, self.lit) else replace(self, lit=found)
 
     def _most_often(self, off: Bool, least: float) -> _Other:
         """What explains most of a point's samples that are ``off``, (T, N), if at least so many
@@ -159,7 +160,7 @@ class Sampled:
         mistaken = points[changed]
         if self._passed(self.on_line[:, mistaken], other.seen[:, mistaken]):
             return None
-        found[:, points[changed]] = ground[:, changed]
+        found[:, mistaken] = ground[:, changed]
         return then
 
     @staticmethod

@@ -33,7 +33,7 @@ def sampled(frames: list[np.ndarray], lit: np.ndarray) -> Sampled:
 
 
 def uncovered(frames: list[np.ndarray], lit: np.ndarray) -> np.ndarray:
-    return sampled(frames, lit).uncovered().T.reshape(*SIZE, 3)
+    return sampled(frames, lit).uncovered().lit.T.reshape(*SIZE, 3)
 
 
 def from_the(middle: int, before: np.ndarray, after: np.ndarray) -> list[np.ndarray]:
@@ -87,7 +87,7 @@ def test_lasting_shade_that_looks_like_what_is_around_is_no_ground() -> None:
     frames = from_the(8, lit, dark)
     assert not sampled(frames, lit).on_line.all()
     given_lit = sampled(frames, lit)
-    assert np.array_equal(given_lit.uncovered(), given_lit.lit)
+    assert np.array_equal(given_lit.uncovered().lit, given_lit.lit)
 
 
 def test_somebody_who_only_passes_is_put_nowhere() -> None:
@@ -112,26 +112,26 @@ def test_somebody_who_passes_in_the_grounds_mean_colour_is_no_ground(grain: floa
     ]
     frames = [np.where(place[..., np.newaxis], coat, lit) for place in places]
     known = sampled(frames, lit)
-    assert np.array_equal(known.uncovered(), known.lit)
+    assert np.array_equal(known.uncovered().lit, known.lit)
 
 
 def test_where_neither_goes_on_nothing_is_changed() -> None:
     lit = np.where(PLACE, np.float32([0.7, 0.1, 0.1]), ground()).astype(np.float32)
     figure = np.where(PLACE, COAT, lit)
     known = sampled(from_the(10, lit, figure), figure)
-    assert np.array_equal(known.uncovered(), known.lit)
+    assert np.array_equal(known.uncovered().lit, known.lit)
 
 
 def test_a_place_that_fills_the_picture_has_nothing_around_it() -> None:
     lit = ground()
     known = sampled(from_the(12, np.broadcast_to(COAT, lit.shape), lit), lit)
-    assert np.array_equal(known.uncovered(), known.lit)
+    assert np.array_equal(known.uncovered().lit, known.lit)
 
 
 def test_nobody_is_looked_for_where_all_is_ground() -> None:
     lit = ground()
     known = sampled([lit, lit * RATIO] * 10, lit)
-    assert np.array_equal(known.uncovered(), known.lit)
+    assert np.array_equal(known.uncovered().lit, known.lit)
 
 
 def test_what_is_known_stays_as_it_was() -> None:

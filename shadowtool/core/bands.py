@@ -1,4 +1,4 @@
-"""Working through a picture a few rows at a time, so that what is in hand stays in the cache."""
+"""Working through a picture a part at a time, so that what is in hand stays in the cache."""
 
 from collections.abc import Iterator
 
@@ -22,6 +22,12 @@ def bands(shape: tuple[int, ...], channels: int = 3) -> Iterator[slice]:
     step = max(1, _VALUES // max(width * channels, 1))
     for start in range(0, height, step):
         yield slice(start, min(start + step, height))
+
+
+def blocks(count: int, together: int) -> Iterator[slice]:
+    """Parts of so many values in a row, as many together as are given."""
+    for start in range(0, count, together):
+        yield slice(start, min(start + together, count))
 
 
 def overlapping_bands(height: int, reach: int, rows: int = 192) -> list[tuple[slice, slice]]:

@@ -9,6 +9,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import blocks
 from shadowtool.core.noise import NoiseModel
 
 Float32 = NDArray[np.float32]
@@ -35,8 +36,7 @@ def line_distance(
     arrays = np.broadcast_arrays(image, lit, shadow)
     pixels = [values.reshape(-1, 3) for values in arrays]
     flat = np.empty(len(pixels[0]), np.float32)
-    for start in range(0, flat.size, _BLOCK):
-        part = slice(start, start + _BLOCK)
+    for part in blocks(flat.size, _BLOCK):
         colours, light, shade = (channels(values[part]) for values in pixels)
         flat[part] = Weighed(colours, noise, tolerance).line_distance(light, shade)
     return flat.reshape(arrays[0].shape[:-1])
@@ -60,6 +60,12 @@ class Weighed:
             sigma += value
             self._weight = 1 / np.maximum(sigma, np.float32(1e-6), out=sigma)
         self._colours = colours
+
+    def part(self, where: slice) -> "Weighed":
+        """Some of the colours in a row; nothing is copied."""
+        part = copy(self)
+        part._colours, part._weight = self._colours[:, where], self._weight[:, where]
+        return part
 
     def take(self, where: NDArray[np.intp]) -> "Weighed":
         """Some of the colours."""

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import blocks
 from shadowtool.core.half_floats import rounded, to_float
 from shadowtool.core.half_keys import from_keys, to_keys
 
@@ -155,7 +156,7 @@ class CrossingFinder:
         size = len(self._state.at)
         at, lost = np.empty(size, np.int32), np.empty(size, bool)
         before, after, low, high = (np.empty(size, np.float32) for _ in range(4))
-        for pixels in _blocks(size):
+        for pixels in blocks(size, _BLOCK):
             state = self._state.part(pixels)
             threshold = _midway(state.low, state.high)
             # Light that grew after the crossing has raised the threshold: it lies earlier.
@@ -204,7 +205,7 @@ class CrossingFinder:
         """Look at the frames that wait."""
         if not self._waiting:
             return
-        for pixels in _blocks(len(self._state.at)):
+        for pixels in blocks(len(self._state.at), _BLOCK):
             new = [frame[pixels] for frame in self._waiting]
             self._look(self._state.part(pixels), [frame[pixels] for frame in self._seen], new)
         self._seen.extend(self._waiting)
@@ -365,10 +366,6 @@ def _search(
     state.at[pixels] = first + found.astype(np.int32)
     for part, ago in ((state.after, 0), (state.before, 1), (state.earlier, 2)):
         part[pixels] = values.ravel()[place - ago * count]
-
-
-def _blocks(size: int) -> list[slice]:
-    return [slice(start, min(start + _BLOCK, size)) for start in range(0, size, _BLOCK)]
 
 
 def _value(keys: Int16) -> Float32:

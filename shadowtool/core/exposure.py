@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from shadowtool.core.bands import bands, channel_sum
 from shadowtool.core.flicker import band_gains
 from shadowtool.core.half_floats import rounded, to_float
+from shadowtool.core.medians import median
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -205,11 +206,6 @@ def _closed_in(ratios: Float32, centre: float, spread: float = 0.0) -> float:
     return centre
 
 
-def _median(values: Float32) -> float:
-    """Of numbers (N,), the upper one of two; by a sort, several times faster than numpy's own."""
-    return float(np.sort(values)[values.size // 2])
-
-
 def sampled_areas(gray: NDArray[np.floating]) -> Float32:
     """Means of runs of pixels in evenly spaced rows, (H, W) to (h, w); what is left over at the
     right is left out."""
@@ -248,12 +244,12 @@ class RunningGain:
         changes = _ratios(gray, self._last)
         if not changes.size:
             return self._gain()
-        middle = _median(changes)
+        middle = float(median(changes))
         # Of a picture that a shadow leaves all but black nothing can be told.
         agreed = np.count_nonzero(np.abs(changes - middle) < _NEAR[0])
         if agreed < max(_LEAST_PART * gray.size, _LEAST_PIXELS):
             return self._gain()
-        spread = 1.48 * _median(np.abs(changes - middle))
+        spread = 1.48 * float(median(np.abs(changes - middle)))
         expected = self._logarithm + _closed_in(changes, middle, spread)
         ratios = _ratios(gray, self._first)
         same = np.abs(ratios - expected) < max(_NEAR[0], spread)
@@ -274,7 +270,7 @@ def common_reference(samples: list[Float32]) -> Float32:
     that most of them agree in lifts it again. Where a lamp flickers, each row is taken to be as
     often lighter as darker.
     """
-    reference = _middle(samples)
+    reference = median(np.stack(samples))
     # By levels alone first: where shade lasts that middle is darker, as if all frames had bands.
     reference = _in_middle_light(samples, [frame_gain(sample, reference) for sample in samples])
     banded = flickers(samples, reference)
@@ -299,17 +295,8 @@ def _row_gains_of_all(samples: list[Float32], reference: Float32, banded: bool) 
 def _in_middle_light(samples: list[Float32], gains: Sequence[Gains]) -> Float32:
     """The median of frames without what tells their gains from the middle one."""
     level = float(np.median([level_of(gain) for gain in gains]))
-    return _middle(
-        [without_gain(sample, gain / level) for sample, gain in zip(samples, gains, strict=True)]
-    )
-
-
-def _middle(samples: list[Float32]) -> Float32:
-    """The median of pictures, pixel by pixel, NaN where one is; by a sort, several times faster
-    than numpy's own."""
-    ordered = np.sort(samples, axis=0)
-    middle = (ordered[(len(samples) - 1) // 2] + ordered[len(samples) // 2]) / np.float32(2)
-    return np.asarray(np.where(np.isnan(ordered[-1]), ordered[-1], middle), np.float32)
+    pairs = zip(samples, gains, strict=True)
+    return median(np.stack([without_gain(sample, gain / level) for sample, gain in pairs]))
 
 
 def without_gain(image: NDArray[np.floating], gain: Gains) -> NDArray[np.floating]:

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.bands import channel_sum
+from shadowtool.core.medians import known_median
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -46,7 +47,7 @@ def band_gains(image: Float32, reference: Float32, level: float, rows: Float64) 
     places = np.flatnonzero(known)
     if len(places) < max(_LEAST_ROWS * len(strips), 1):
         return None
-    usual = _middles(strips[known])
+    usual = known_median(strips[known])
     # By a sort, several times faster than numpy's quantiles.
     low, middle, high = np.sort(usual)[[round(part * (len(usual) - 1)) for part in (0.1, 0.5, 0.9)]]
     off_middle = abs(middle - (low + high) / 2)
@@ -91,15 +92,7 @@ def _of_strips(image: Float32, reference: Float32, level: float) -> Float64 | No
     ratio = np.where(usable, ratio, np.float32(np.nan))[:, : _STRIPS * width]
     ratio = ratio.reshape(-1, _STRIPS, width)
     enough = 2 * np.count_nonzero(np.isfinite(ratio), axis=2) >= width
-    return np.where(enough, _middles(ratio), np.nan).astype(np.float64)
-
-
-def _middles(values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Medians along the last axis, (..., N) to (...), of what is known; the lower one of two."""
-    # What is unknown comes last.
-    ordered = np.sort(values, axis=-1)
-    middle = np.maximum(np.isfinite(values).sum(axis=-1) - 1, 0) // 2
-    return np.asarray(np.take_along_axis(ordered, middle[..., np.newaxis], axis=-1)[..., 0])
+    return np.where(enough, known_median(ratio), np.nan).astype(np.float64)
 
 
 def _waves(cycles: Float64, rows: Float64) -> Float64:

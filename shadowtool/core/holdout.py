@@ -14,8 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import blocks
 from shadowtool.core.color_line import Weighed, channels, line_distance
 from shadowtool.core.half_floats import to_float
+from shadowtool.core.medians import median
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.standing import Sampled
 
@@ -79,6 +81,8 @@ _EVEN, _LOOKS = 0.15, 3
 _SHADE_ENDS, _LIGHT_BEGINS, _BETWEEN = 0.15, 0.85, 0.75
 # Candidates for L are every so many of a pixel's samples, dark to bright.
 _EVERY = 2
+# Pixels that are looked at together: what is known of each of their samples stays in the cache.
+_BLOCK = 1 << 14
 # Decided pixels are dropped when no more than this part is left.
 _WORTHWHILE = 0.75
 # A part of the scene in shade that the common ratio does not explain: so many samples at least.
@@ -142,7 +146,11 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
     ascending = np.argsort(stack.sum(axis=1), axis=0)
     ratio = _common_ratio(stack, ascending, noise, shape[:2])
-    lit = _most_supported(stack, ascending, weighed, ratio)
+    lit = np.empty_like(ratio)
+    for part in blocks(lit.shape[1], _BLOCK):
+        samples_part = [sample.part(part) for sample in weighed]
+        of_points = stack[..., part], ascending[:, part], samples_part, ratio[:, part]
+        lit[:, part] = _most_supported(*of_points)
     known = Sampled(stack, weighed, lit, ratio, shape[:2]).uncovered()
     lit, on_line = known.lit, list(known.on_line)
     shadow = lit * ratio
@@ -275,7 +283,7 @@ def _common_ratio(
     least = (_DEEPER if penumbra else _BLACK) * (0 if common is None else common.samples)
     if black.sum() > max(least, _TELLING):
         _, ratios = _ratios(stack, bright, black)
-        ratio = np.clip(np.median(ratios, axis=0), 0, _LIGHTEST_RATIO)
+        ratio = np.clip(median(ratios), 0, _LIGHTEST_RATIO)
         return np.repeat(ratio[:, np.newaxis], light.size, axis=1)
     if common is None:
         return np.full(bright.shape, 0.25, np.float32)
@@ -440,15 +448,15 @@ def _told(compared: _Compared, chosen: Bool, noise: NoiseModel) -> tuple[Float32
     noisy = noise.sigma(own) / np.maximum(own, np.float32(1e-4))
     within = _CLUSTER * np.hypot(noisy, _SCATTER)
     colour = logarithm - logarithm.mean(axis=1, keepdims=True)
-    inside = (np.abs(colour - _densest(colour, float(np.median(within)))) < within).all(axis=1)
+    inside = (np.abs(colour - _densest(colour, float(median(within.ravel())))) < within).all(axis=1)
     for _ in range(_ROUNDS if inside.any() else 0):
         before = inside
-        inside = (np.abs(colour - np.median(colour[inside], axis=0)) < within).all(axis=1)
+        inside = (np.abs(colour - median(colour[inside])) < within).all(axis=1)
         if np.array_equal(inside, before):
             break
     pure = max(float(inside.mean()), _LEAST_LIKELY)
-    ratio = np.median(ratios[inside] if inside.any() else ratios, axis=0)
-    return np.clip(ratio, 0, _LIGHTEST_RATIO), pure, float(np.median(noisy))
+    ratio = median(ratios[inside] if inside.any() else ratios)
+    return np.clip(ratio, 0, _LIGHTEST_RATIO), pure, float(median(noisy.ravel()))
 
 
 def _densest(colour: Float32, width: float) -> Float32:

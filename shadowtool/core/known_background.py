@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.backdrop import Backdrop
+from shadowtool.core.bands import blocks
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.transfer import LUMA
 from shadowtool.core.trimap import FIGURE, UNKNOWN, Prior
@@ -178,8 +179,8 @@ def colours(
 def _blocks(mask: Bool) -> Iterator[Places]:
     """The mask's pixels, so many at a time that memory stays bounded."""
     rows, columns = np.nonzero(mask)
-    for start in range(0, rows.size, _BLOCK):
-        yield rows[start : start + _BLOCK], columns[start : start + _BLOCK]
+    for part in blocks(rows.size, _BLOCK):
+        yield rows[part], columns[part]
 
 
 class _Around(NamedTuple):

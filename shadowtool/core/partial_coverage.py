@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shadowtool.core.bands import channel_sum
+from shadowtool.core.bands import blocks, channel_sum
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.noise import NoiseModel
 
@@ -189,8 +189,8 @@ def complete_shadow(
     own[region & ~(darker | alike | (_large(surface & above) & ~alone))] = 0
     # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
     both = np.flatnonzero(alike & region & (own > 0))
-    for start in range(0, both.size, _BLOCK):
-        where = both[start : start + _BLOCK]
+    for part in blocks(both.size, _BLOCK):
+        where = both[part]
         measured, ratios = (p.reshape(-1, 3).take(where, axis=0) for p in (result, expected))
         precision = frames.reshape(-1, 1).take(where, axis=0) / noise.variance(measured)
         prior = 1 / np.maximum(spread * ratios, 1e-6) ** 2

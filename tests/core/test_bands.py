@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shadowtool.core.bands import bands, in_all_channels
+from shadowtool.core.bands import bands, blocks, in_all_channels
 
 
 @pytest.mark.parametrize(
@@ -26,3 +26,10 @@ def test_a_plane_is_the_same_in_all_channels():
     spread = in_all_channels(plane)
     assert spread.shape == (4, 5, 3)
     assert all(np.array_equal(spread[..., c], plane) for c in range(3))
+
+
+@pytest.mark.parametrize("count", [0, 1, 4, 5, 9])
+def test_every_value_is_in_one_block(count):
+    parts = [range(count)[part] for part in blocks(count, together=4)]
+    assert [place for part in parts for place in part] == list(range(count))
+    assert all(len(part) == 4 for part in parts[:-1])

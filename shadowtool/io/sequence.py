@@ -25,7 +25,16 @@ Frame = int | Decimal
 # Frame numbers further apart than this are not one sequence.
 _WIDEST = 1_000_000
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
-_TOKENS = re.compile(r"[#@]|%\d*d|\$F\d*|<UDIM>")
+# What stands between a name and a number.
+_SEPARATORS = "._- "
+_TOKEN = r"(?:[#@]|%\d*d|\$F\d*|<UDIM>)"
+_TOKENS = re.compile(_TOKEN)
+# A dash is a minus at a name's beginning and after a separator; else it belongs to the name.
+# fileseq takes all for minuses, but none that is cut off by what no name holds.
+_MINUS, _CUT = r"(?:(?<![^._-])-)?", "\0_"
+_RANGE = r"\d+(?:--?\d+(?:[xy:]-?\d+)?)?"
+_OF_FILE = re.compile(rf"(.*?)({_MINUS}\d+(?:\.\d+)?\.[^.]+)")
+_OF_PATTERN = re.compile(rf"(.*?)((?:{_MINUS}{_RANGE}(?:,-?{_RANGE})*)?{_TOKEN}+\.[^.]+)")
 
 
 @dataclass(frozen=True)
@@ -222,7 +231,7 @@ def _sequences(folder: Path) -> list[_Found]:
         for path in folder.iterdir()
         if not path.name.startswith(".") and path.suffix.lower() in (EXR, PNG)
     ]
-    names = sorted(path.name for path in pictures if is_file(path) or leads_nowhere(path))
+    names = sorted(_cut(path.name) for path in pictures if is_file(path) or leads_nowhere(path))
     try:
         found = findSequencesInList(names)
         numbered = [s for s in found if s.frameSet()]
@@ -245,15 +254,15 @@ def _fractions(frames: list[Frame]) -> bool:
 
 def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
     frame_set = sequence.frameSet()
-    base, suffix = sequence.basename(), sequence.extension()
+    base, suffix = _whole(sequence.basename()), sequence.extension()
     if not frame_set:
-        path = folder / str(sequence)
+        path = folder / _whole(str(sequence))
         return _Found(_single(path), base, suffix, digits=0)
-    places = {frame: folder / sequence.frame(frame) for frame in sorted(_frames(frame_set))}
+    places = {frame: folder / _whole(sequence.frame(frame)) for frame in sorted(_frames(frame_set))}
     gone = tuple(frame for frame, path in places.items() if leads_nowhere(path))
     files = {frame: path for frame, path in places.items() if frame not in gone}
     digits = max(sequence.zfill(), 1)
-    name = base.rstrip("._- ") or real(folder).name
+    name = base.rstrip(_SEPARATORS) or real(folder).name
     pattern = os.fspath(folder / f"{base}{'#' * digits}{suffix}")
     if not files:
         raise InputError(f"{pattern}: links that lead nowhere; restore what they lead to")
@@ -263,10 +272,10 @@ def _from_fileseq(folder: Path, sequence: FileSequence) -> _Found:
 def _single(path: Path) -> Sequence:
     if path.suffix.lower() not in (EXR, PNG):
         raise _unreadable(path)
-    number = re.fullmatch(r"(.*)[._](-?\d+)", path.stem) or re.fullmatch(r"(.*?)-?(\d+)", path.stem)
+    number = re.fullmatch(rf"(.*?)({_MINUS}\d+)", path.stem)
     if number is None:
         return Sequence(path.stem, os.fspath(path), {1: path})
-    name = number[1] or real(path).parent.name
+    name = number[1].rstrip(_SEPARATORS) or real(path).parent.name
     return Sequence(name, os.fspath(path), {int(number[2]): path})
 
 
@@ -276,8 +285,8 @@ def _of_pattern(path: Path, role: str) -> Sequence:
         raise _unreadable(path)
     try:
         # One digit for each #, as we write patterns ourselves.
-        wanted = FileSequence(path.name, pad_style=PAD_STYLE_HASH1)
-        base, asked = wanted.basename(), _frames(wanted.frameSet() or ())
+        wanted = FileSequence(_cut(path.name), pad_style=PAD_STYLE_HASH1)
+        base, asked = _whole(wanted.basename()), _frames(wanted.frameSet() or ())
         found = [
             item
             for item in _sequences(path.parent)
@@ -303,6 +312,17 @@ def _of_pattern(path: Path, role: str) -> Sequence:
         raise InputError(f"{sequence.pattern}: missing frames {frame_range(absent)}")
     files = {frame: sequence.files[frame] for frame in sorted(asked)}
     return Sequence(sequence.name, sequence.pattern, files)
+
+
+def _cut(name: str) -> str:
+    """A file's name or a pattern, so that fileseq takes no dash in it for a minus that is none."""
+    parts = _OF_FILE.fullmatch(name) or _OF_PATTERN.fullmatch(name)
+    return f"{parts[1]}{_CUT}{parts[2]}" if parts and parts[1].endswith("-") else name
+
+
+def _whole(name: str) -> str:
+    """A name as it was before `_cut`."""
+    return name.replace(_CUT, "")
 
 
 def _frames(frame_set: Iterable[int | float | Decimal]) -> list[Frame]:

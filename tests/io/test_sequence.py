@@ -129,6 +129,30 @@ def test_a_single_files_number_may_be_negative(folder):
     assert open_sequence(folder("a.-003.exr") / "a.-003.exr").frames == (-3,)
 
 
+@pytest.mark.parametrize("base", ["a-", "2024-11-29-", "a b-", "a.b-"])
+@pytest.mark.parametrize("pattern", ["", "####", "%04d", "1001-1003#"])
+def test_a_dash_between_name_and_number_is_no_minus(base, pattern, folder):
+    place = folder(*(f"{base}{number}.exr" for number in (1001, 1002, 1003)))
+    sequence = open_sequence(place / f"{base}{pattern}.exr" if pattern else place)
+    assert sequence.frames == (1001, 1002, 1003)
+    assert sequence.path(1002) == place / f"{base}1002.exr"
+    assert sequence.name == base.rstrip("-")
+    alone = open_sequence(place / f"{base}1002.exr")
+    assert (alone.name, alone.frames) == (sequence.name, (1002,))
+
+
+@pytest.mark.parametrize("base", ["", "a.", "a_", "a-"])
+def test_a_dash_at_the_beginning_or_after_a_separator_is_a_minus(base, folder):
+    place = folder(*(f"{base}{number}.exr" for number in ("-002", "-001", "0000", "0001")))
+    assert open_sequence(place).frames == (-2, -1, 0, 1)
+    assert open_sequence(place / f"{base}-002.exr").frames == (-2,)
+
+
+def test_fractional_numbers_may_follow_a_dash(folder):
+    place = folder(*(f"a-{number}.exr" for number in QUARTERS))
+    assert files(open_sequence(place)) == {Decimal(n): f"a-{n}.exr" for n in QUARTERS}
+
+
 def test_numbers_need_no_padding(folder):
     place = folder("a.1.exr", "a.9.exr", "a.10.exr", "a.100.exr")
     assert open_sequence(place).frames == (1, 9, 10, 100)

@@ -4,7 +4,7 @@ import itertools
 import os
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
@@ -46,12 +46,14 @@ class Sequence:
         pattern: how a person would write it, for messages and records.
         files: path by frame number, ascending.
         gone: frames of which there is no more than a link to nothing.
+        asked: frames that the pattern itself names, ascending; none for whatever is there.
     """
 
     name: str
     pattern: str
     files: dict[Frame, Path]
     gone: tuple[Frame, ...] = ()
+    asked: tuple[Frame, ...] = ()
 
     @property
     def frames(self) -> tuple[Frame, ...]:
@@ -105,7 +107,8 @@ class Sequence:
         """The frames to work on, and those that should be there but aren't.
 
         Args:
-            frames: a range such as ``1001-1048x2,1100``; None for all.
+            frames: a range such as ``1001-1048x2,1100``; None for all that were asked for, or are
+                there.
             missing: "error" refuses to go on without the missing ones.
 
         Raises:
@@ -113,7 +116,7 @@ class Sequence:
             OptionError: the range can't be read.
         """
         if frames is None:
-            wanted: Iterable[Frame] = sorted({*self.files, *self.gaps(), *self.gone})
+            wanted: Iterable[Frame] = self.asked or sorted({*self.files, *self.gaps(), *self.gone})
         else:
             wanted = parse_frames(frames)
         present = [frame for frame in wanted if frame in self.files]
@@ -286,7 +289,7 @@ def _of_pattern(path: Path, role: str) -> Sequence:
     try:
         # One digit for each #, as we write patterns ourselves.
         wanted = FileSequence(_cut(path.name), pad_style=PAD_STYLE_HASH1)
-        base, asked = _whole(wanted.basename()), _frames(wanted.frameSet() or ())
+        base, asked = _whole(wanted.basename()), sorted(_frames(wanted.frameSet() or ()))
         found = [
             item
             for item in _sequences(path.parent)
@@ -307,11 +310,13 @@ def _of_pattern(path: Path, role: str) -> Sequence:
     sequence = found[0].sequence
     if not asked:
         return sequence
-    absent = [frame for frame in asked if frame not in sequence.files]
-    if absent:
-        raise InputError(f"{sequence.pattern}: missing frames {frame_range(absent)}")
-    files = {frame: sequence.files[frame] for frame in sorted(asked)}
-    return Sequence(sequence.name, sequence.pattern, files)
+    files = {frame: sequence.files[frame] for frame in asked if frame in sequence.files}
+    if not files:
+        raise InputError(
+            f"{sequence.pattern}: missing frames {frame_range(asked)};"
+            f" it has only {frame_range(sequence.files)}"
+        )
+    return replace(sequence, files=files, asked=tuple(asked))
 
 
 def _cut(name: str) -> str:

@@ -107,8 +107,22 @@ def test_a_pattern_with_a_range_takes_that_range_only(folder):
 
 def test_frames_of_a_patterns_range_that_are_not_there_are_named(folder):
     place = folder(*take("a", [1001, 1003]))
-    with pytest.raises(InputError, match=r"a\.####\.exr: missing frames 1002,1004$"):
-        open_sequence(place / "a.1001-1004#.exr")
+    with pytest.raises(InputError, match=r"a\.####\.exr: missing frames 1002,1004;"):
+        open_sequence(place / "a.1001-1004#.exr").select(None)
+    with pytest.raises(InputError, match=r"a\.####\.exr: missing frames 1-9; it has only"):
+        open_sequence(place / "a.1-9#.exr")
+
+
+def test_frames_of_a_patterns_range_that_are_not_there_may_be_skipped(folder):
+    place = folder(*take("a", [1001, 1003]))
+    sequence = open_sequence(place / "a.1001-1004#.exr")
+    assert sequence.select(None, missing="skip") == ([1001, 1003], [1002, 1004])
+
+
+def test_frames_that_a_pattern_does_not_ask_for_are_not_missing(folder):
+    place = folder(*take("a", range(1001, 1007)))
+    sequence = open_sequence(place / "a.1001-1002,1005#.exr")
+    assert sequence.select(None) == ([1001, 1002, 1005], [])
 
 
 @pytest.mark.parametrize(

@@ -6,15 +6,15 @@ from typing import Any
 import click
 
 from shadowtool.choices import FILLS
-from shadowtool.cli.options import folder_option, format_option, step_command
+from shadowtool.cli.options import GivenPath, folder_option, format_option, step_command
 
 
 @click.command()
-@click.argument("mattes", metavar="[MATTE]", required=False, type=click.Path(path_type=Path))
+@click.argument("mattes", metavar="[MATTE]", required=False, type=GivenPath())
 @folder_option("--plates", "plates", "Plates of the target scene.", required=True)
 @click.option(
     "--warp",
-    type=click.Path(path_type=Path),
+    type=GivenPath(),
     metavar="FILE",
     help="ST map from warp; without it the shadow stays as it fell in the source.",
 )

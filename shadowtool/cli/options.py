@@ -17,19 +17,23 @@ from shadowtool.cli.report import report
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class _Folder(click.Path):
-    """A folder's name; an empty one, as of a shell's variable that is not set, is none."""
+class GivenPath(click.Path):
+    """The name of a file or folder; an empty one, as of a shell's variable that is not set, is
+    none."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if value == "":
-            self.fail("is empty; name a folder", param, ctx)
+            self.fail("is empty; name a file or a folder", param, ctx)
         return super().convert(value, param, ctx)
 
 
 output_option = click.option(
     "-o",
     "--output",
-    type=_Folder(path_type=Path),
+    type=GivenPath(),
     required=True,
     metavar="DIR",
     help="Folder to write to; made if it isn't there.",
@@ -112,7 +116,7 @@ def folder_option(
     return click.option(
         name,
         parameter,
-        type=_Folder(path_type=Path),
+        type=GivenPath(),
         metavar="DIR",
         required=required,
         help=help_text,

@@ -6,22 +6,22 @@ from typing import Any
 import click
 
 from shadowtool.choices import ITERATIONS, OUTSIDE
-from shadowtool.cli.options import step_command
+from shadowtool.cli.options import GivenPath, step_command
 
 
 @click.command()
-@click.argument("scans", metavar="[SCAN]...", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("scans", metavar="[SCAN]...", nargs=-1, type=GivenPath())
 @click.option(
     "--map",
     "map_file",
-    type=click.Path(path_type=Path),
+    type=GivenPath(),
     metavar="FILE",
     help="Use this ST map instead of solving one from scans.",
 )
 @click.option(
     "--source-scan",
     "source_scans",
-    type=click.Path(path_type=Path),
+    type=GivenPath(),
     multiple=True,
     metavar="SCAN",
     help="A scan of the source, for a source that isn't flat; give two or more.",

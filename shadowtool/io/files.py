@@ -210,6 +210,11 @@ def real(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def size_of(path: Path) -> int:
+    """How many bytes a file has. Raises InputError as `read_bytes` does."""
+    return _version(path).size
+
+
 def is_file(path: Path) -> bool:
     """Whether a file is there, also under a name that can't be one."""
     try:

@@ -201,7 +201,7 @@ class _Report:
     likeness: list[tuple[Frame, float]] = field(default_factory=list)
     seconds: list[tuple[Frame, float]] = field(default_factory=list)
     clipped: list[float] = field(default_factory=list)
-    marks: dict[str, str] = field(default_factory=dict)
+    marks: dict[Frame, str] = field(default_factory=dict)
     not_finite: dict[str, int] = field(default_factory=dict)
     kept: int = 0
     before: Float32 | None = None
@@ -282,7 +282,7 @@ class _Taking:
             if isinstance(done, _Measured):
                 frames.append(done.arriving.frame)
                 report.add(done)
-                report.marks[str(done.arriving.frame)] = done.mark
+                report.marks[done.arriving.frame] = done.mark
             else:
                 skipped.append(done)
             self.run.progress(number, max(total, number) if total else 0)
@@ -351,12 +351,21 @@ class _Taking:
             "capture", self.output, frames, len(frames), self.source.absent, _figures(record)
         )
 
-    def finish(self, mark: str, marks: dict[str, str]) -> None:
+    def _is_of_this(self, frame: Frame, row: Figures) -> bool:
+        try:
+            return self.source.size_of(frame) == row.get("read")
+        except InputError:
+            return False
+
+    def finish(self, mark: str, marks: dict[Frame, str]) -> None:
         """Write the manifest, together with what other chunks of the same wrote."""
-        rows: dict[str, Any] = {frame: {"fingerprint": own} for frame, own in marks.items()}
+        rows: dict[str, Any] = {
+            str(frame): {"fingerprint": own, "read": self.source.size_of(frame)}
+            for frame, own in marks.items()
+        }
         with folder_lock(self.output):
             rows = with_other_chunks(
-                self.output, mark, rows, lambda frame: [self.place(frame)], self.source.has
+                self.output, mark, rows, lambda frame: [self.place(frame)], self._is_of_this
             )
             write_manifest(self.output, self.recipe, mark, {}, rows)
 

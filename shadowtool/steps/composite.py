@@ -31,7 +31,7 @@ from shadowtool.io.image import (
 )
 from shadowtool.io.products import made_by, map_place, read_plates, read_warp
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
-from shadowtool.steps.footage import require_frames, require_size, say_taken_as
+from shadowtool.steps.footage import require_frames, require_size, say_taken_as, select_from
 from shadowtool.steps.matte import BETA_FOLDER, FIGURE_FOLDER
 from shadowtool.steps.run import (
     Figures,
@@ -78,9 +78,14 @@ def composite(
     Raises:
         InputError: an input is missing, or pictures differ in size.
     """
-    figure_frames = open_sequence(foreground or _part(mattes, FIGURE_FOLDER), "figure")
-    beta_frames = open_sequence(beta or _part(mattes, BETA_FOLDER), "β")
-    frames, absent = beta_frames.select(run.frames, run.missing)
+    figure_frames, beta_frames = (
+        open_sequence(_part(mattes, folder) if given is None else given, role)
+        for given, folder, role in (
+            (foreground, FIGURE_FOLDER, "figure"),
+            (beta, BETA_FOLDER, "β"),
+        )
+    )
+    frames, absent = select_from((figure_frames, beta_frames), run.frames, run.missing)
     stored = read_plates(plates)
     say_taken_as(plates, stored.transfer)
     figure_transfer = resolve_transfer("auto", figure_frames.path(figure_frames.frames[0]))

@@ -198,6 +198,17 @@ def _require_same(path: Path, header: Header, first: Header, of: str) -> None:
         )
 
 
+def select_from(
+    sequences: Iterable[Sequence], frames: str | None, missing: Missing
+) -> tuple[list[Frame], list[Frame]]:
+    """`Sequence.select` from sequences that belong together: a frame that any of them has, or
+    should have, is wanted, and present if it is in one. Raises as that does."""
+    chosen = [sequence.select(frames, missing) for sequence in sequences]
+    present = {frame for own, _ in chosen for frame in own}
+    absent = {frame for _, own in chosen for frame in own}
+    return sorted(present), sorted(absent - present)
+
+
 def require_frames(
     sequence: Sequence, frames: Iterable[Frame], expected: Header, of: str, missing: Missing
 ) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Missing
 from shadowtool.errors import DamagedFileError, InputError, OptionError
-from shadowtool.io.files import fingerprint_file, fingerprint_movie
+from shadowtool.io.files import fingerprint_file, fingerprint_movie, size_of
 from shadowtool.io.image import EXR, PNG, Header
 from shadowtool.io.sequence import Frame, parse_frames
 from shadowtool.io.video import Movie, MovieFrame, camera_frames
@@ -75,7 +75,8 @@ class Source:
         folder: where a sequence's files are.
         marks: reads the fingerprint of each wanted frame, on so many threads, where a frame is a
             file of its own; else empty.
-        has: whether there is a frame of this number, wanted or not; of a movie all may be there.
+        size_of: how many bytes the file of this frame, wanted or not, has; 0 where frames have no
+            files of their own. Raises InputError if there is none.
     """
 
     name: str
@@ -91,7 +92,7 @@ class Source:
     absent: list[Frame] = field(default_factory=list)
     folder: Path | None = None
     marks: Callable[[int | None], dict[Frame, str]] = lambda jobs: {}
-    has: Callable[[Frame], bool] = lambda frame: True
+    size_of: Callable[[Frame], int] = lambda frame: 0
 
 
 def open_source(
@@ -219,7 +220,7 @@ def _sequence(
         absent=[frame + offset for frame in absent],
         folder=Path(footage.sequence.pattern).parent,
         marks=marks,
-        has=lambda frame: frame - offset in footage.sequence.files,
+        size_of=lambda frame: size_of(footage.sequence.path(frame - offset)),
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from shadowtool import __version__
 from shadowtool.choices import Missing
 from shadowtool.errors import InputError, MissingError, OptionError, OutputExistsError
-from shadowtool.io.files import fingerprinted, is_file, new_folders, real
+from shadowtool.io.files import fingerprinted, is_file, new_folders, real, size_of
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame, frame_number, frame_range
@@ -231,22 +231,23 @@ class FrameWork:
             refuse_inputs(self.products(frame), sources)
             with fingerprinted(sources) as inputs:
                 mark = self.recipe.fingerprint([*self.shared, *inputs])
+                read = sum(map(size_of, sources))
                 if run.resume and (figures := current(self.products(frame), mark)) is not None:
-                    return {"fingerprint": mark, **figures}, True
+                    return {"fingerprint": mark, "read": read, **figures}, True
                 figures = self.make(frame, self.recipe.provenance(mark))
+                return {"fingerprint": mark, "read": read, **figures}, False
         except MissingError as error:
             if run.missing == "skip":
                 say_skipped(error)
                 return None
             raise
-        return {"fingerprint": mark, **figures}, False
 
     def _record(
         self, rows: dict[str, Figures], summary: Callable[[list[Figures]], Figures]
     ) -> Figures:
         key = self.recipe.fingerprint(self.shared)
         with folder_lock(self.output):
-            merged = with_other_chunks(self.output, key, rows, self.products, self._has_sources)
+            merged = with_other_chunks(self.output, key, rows, self.products, self._is_of_these)
             try:
                 figures = summary(list(merged.values()))
             except (AttributeError, TypeError, ValueError, OverflowError):
@@ -255,9 +256,11 @@ class FrameWork:
             write_manifest(self.output, self.recipe, key, figures, merged)
         return figures
 
-    def _has_sources(self, frame: Frame) -> bool:
+    def _is_of_these(self, frame: Frame, row: Figures) -> bool:
+        """Whether a recorded frame was made of the files that are there now, by how many bytes
+        they are: to read those of all other chunks would take too long."""
         try:
-            return all(is_file(file) for file in self.sources(frame))
+            return sum(map(size_of, self.sources(frame))) == row.get("read")
         except InputError:
             return False
 
@@ -267,7 +270,7 @@ def with_other_chunks(
     key: str,
     rows: dict[str, Figures],
     products: Callable[[Frame], list[Path]],
-    has_sources: Callable[[Frame], bool],
+    is_of_these: Callable[[Frame, Figures], bool],
 ) -> dict[str, Figures]:
     """The frames of a manifest: a run's own, and what other chunks of the same have recorded.
 
@@ -277,7 +280,7 @@ def with_other_chunks(
     Args:
         key: the manifest's fingerprint.
         rows: the run's own.
-        has_sources: whether what a frame is made of is still there.
+        is_of_these: whether a frame, by its row, is made of what is read now.
     """
     before = read_record(output / MANIFEST)
     recorded = before.get("frames")
@@ -286,7 +289,7 @@ def with_other_chunks(
         frame = frame_number(name)
         if name in rows or frame is None:
             continue
-        if before.get("fingerprint") == key and has_sources(frame):
+        if before.get("fingerprint") == key and isinstance(row, dict) and is_of_these(frame, row):
             kept[name] = row
         elif any(map(is_file, products(frame))):
             left.append(frame)

@@ -43,6 +43,7 @@ from shadowtool.io.products import (
     read_record,
     read_scan,
     read_warp,
+    write_json,
     write_warp,
 )
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
@@ -132,16 +133,15 @@ def warp(
     if map_file is not None:
         assert applied is not None
         # A folder in which a map was solved keeps the record of that.
-        record_in = applied.folder if is_file(output / WARP) else output
-        return [_apply(map_place(map_file), applied, record_in, run, outside)]
+        also_in = None if is_file(output / WARP) else output
+        return [_apply(map_place(map_file), applied, run, outside, also_in)]
     results = [_solve(scans, source_scans or [], output, run, iterations)]
     if not results[0].kept:
         now = {applied.folder} if applied else set()
         for folder in sorted(_applied_before(output) - now):
             warn_of_left(sorted(folder.glob(f"*{EXR}")))
     if applied is not None:
-        folder = output / applied.sequence.name
-        results.append(_apply(output / WARP, applied, folder, run, outside))
+        results.append(_apply(output / WARP, applied, run, outside))
     return results
 
 
@@ -309,7 +309,16 @@ def _open_frames(source: str | Path, output: Path, run: Run) -> _Frames:
     return frames
 
 
-def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: float) -> Result:
+def _apply(
+    map_file: Path, frames: _Frames, run: Run, outside: float, also_in: Path | None = None
+) -> Result:
+    """Warp frames, and record that beside them.
+
+    Args:
+        also_in: another folder that gets the same record: that of what was last warped into it.
+    """
+    if also_in is not None:
+        refuse_other_step("warp", also_in, run)
     warp_map, header, map_mark = read_warp(map_file)
     sequence = frames.sequence
     recipe = Recipe(
@@ -341,8 +350,11 @@ def _apply(map_file: Path, frames: _Frames, record_in: Path, run: Run, outside: 
     def sources(frame: Frame) -> list[Path]:
         return [sequence.path(frame)]
 
-    work = FrameWork(recipe, record_in, products, sources, [map_mark], make)
-    return work.run(frames.present, run, frames.absent)
+    work = FrameWork(recipe, frames.folder, products, sources, [map_mark], make)
+    result = work.run(frames.present, run, frames.absent)
+    if also_in is not None:
+        write_json(also_in / MANIFEST, read_record(frames.folder / MANIFEST))
+    return result
 
 
 def _has_grain(image: Image) -> bool:

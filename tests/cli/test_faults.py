@@ -515,6 +515,31 @@ def test_an_empty_output_folder_is_none(name, shot, command, tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        ("plate", "--holdout"),
+        ("plate", "--plane"),
+        ("matte", "--plates"),
+        ("matte", "--trimap"),
+        ("matte", "--alpha"),
+        ("scan", "--plane"),
+        ("warp", "--source-scan"),
+        ("warp", "--apply"),
+        ("apply", "--map"),
+        ("composite", "--plates"),
+        ("composite", "--fg"),
+        ("composite", "--beta-frames"),
+        ("composite", "--warp"),
+    ],
+)
+def test_an_empty_name_is_not_as_if_nothing_had_been_named(name, option, shot, command, tmp_path):
+    outcome = command(*shot.arguments(name), option, "", "-o", tmp_path / "out")
+    assert outcome.code in (1, 2), outcome.err
+    assert option in outcome.err or "no file or folder is named" in outcome.err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("name", ["capture", "plate", "scan", "warp", "composite"])
 def test_the_record_of_another_step_is_kept(name, shot, refused, copied):
     other = copied("matte")

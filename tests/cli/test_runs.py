@@ -17,7 +17,7 @@ import pytest
 
 from shadowtool.cli.commands import shadowtool
 from shadowtool.cli.options import PROGRESS
-from shadowtool.io.image import write_png
+from shadowtool.io.image import read_image, write_exr, write_png
 from shadowtool.io.products import read_warp, write_warp
 from tests.conftest import PLANE, write_frames
 
@@ -169,7 +169,7 @@ def test_resume_makes_a_deleted_frame_again_and_leaves_the_others_alone(name, ma
     (output / PRODUCT[name]).unlink()
     make(name, "once", "--resume")
     assert tree(output) == before
-    fresh = {str(Path(p).relative_to(output)) for p, t in times(output).items() if t > 1e18 + 1}
+    fresh = {Path(p).name for p, t in times(output).items() if t > 1e18 + 1}
     assert {p for p in fresh if "1003" not in p} <= {"shadowtool.json", "capture.json"}
 
 
@@ -619,6 +619,41 @@ def test_frames_left_from_a_longer_take_are_named_and_not_recorded(name, shot, c
     assert "frames 1005-1006 are left from an earlier run" in outcome.err
     record = json.loads((output / "shadowtool.json").read_text())
     assert sorted(record["frames"]) == ["1001", "1002", "1003", "1004"]
+
+
+@pytest.mark.parametrize("name", ["capture", "matte", "composite"])
+def test_frames_of_another_take_under_the_same_names_are_no_chunk_of_this_one(
+    name, shot, command, copied, tmp_path
+):
+    read, position = FRAMES_READ[name]
+    words = replaced(shot.arguments(name), position, shot.folder / read)
+    assert command(*words, "-o", tmp_path / "out").code == 0
+    # Same names and size, other pictures.
+    other = copied(read)
+    for file in other.rglob("*.exr"):
+        layers = read_image(file).layers
+        noise = np.random.default_rng(1).normal(1, 0.01, (32, 48))
+        for values in layers.values():
+            values[:] = values * (noise if values.ndim == 2 else noise[..., np.newaxis])
+        write_exr(file, layers)
+    words = replaced(words, position, other)
+    outcome = command(*words, "-o", tmp_path / "out", "--frames", "1001-1003", "--overwrite")
+    assert outcome.code == 0, outcome.err
+    assert "frames 1004-1006 are left from an earlier run" in outcome.err
+    record = json.loads((tmp_path / "out" / "shadowtool.json").read_text())
+    assert sorted(record["frames"]) == ["1001", "1002", "1003"]
+
+
+def test_each_sequence_that_one_map_is_applied_to_has_its_own_record(shot, command, tmp_path):
+    for part, frames in (("beta", "1001-1006"), ("fg", "1001-1003")):
+        words = ["warp", "--map", shot.warp / "warp.exr", "--apply", shot.matte / part]
+        assert command(*words, "-o", tmp_path, "--frames", frames).code == 0
+    known = {
+        part: sorted(json.loads((tmp_path / part / "shadowtool.json").read_text())["frames"])
+        for part in ("beta", "fg", "")
+    }
+    assert known["beta"] == [str(number) for number in range(1001, 1007)]
+    assert known["fg"] == known[""] == ["1001", "1002", "1003"]
 
 
 def test_frames_of_another_movie_are_named(movie, command, tmp_path):

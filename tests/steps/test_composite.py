@@ -1,5 +1,6 @@
 """Figure and shadow in the target scene, from files."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,9 +11,11 @@ from shadowtool.choices import Fill
 from shadowtool.core.beta import inpaint
 from shadowtool.core.compositing import over, shade
 from shadowtool.core.warp_map import WarpMap, identity_map
+from shadowtool.errors import InputError
 from shadowtool.io.image import Header, read_image, write_exr, write_png
 from shadowtool.io.products import WARP, write_warp
 from shadowtool.steps.composite import composite
+from shadowtool.steps.run import Run
 from tests.scene import Scene
 
 SCENE = Scene(60, 90)
@@ -185,3 +188,17 @@ def test_what_a_map_takes_from_outside_the_picture_is_lit(tmp_path: Path) -> Non
     found = read_image(tmp_path / "again" / "again.1001.exr").layers["RGB"]
     assert found[:, -19:] == pytest.approx(SCENE.lit[:, -19:], rel=2e-3)
     assert found[:, :-21] == pytest.approx(SCENE.shadow[:, :-21], rel=2e-3)
+
+
+@pytest.mark.parametrize("lacking", ["fg", "beta"])
+def test_frames_that_only_figure_or_shadow_has_are_missing(tmp_path: Path, lacking: str) -> None:
+    put(tmp_path, empty())
+    other = {"fg": "beta", "beta": "fg"}[lacking]
+    folder = tmp_path / "matte" / other
+    shutil.copy(folder / f"{other}.1001.exr", folder / f"{other}.1002.exr")
+    arguments = {"plates": tmp_path / "plates"}
+    with pytest.raises(InputError, match=f"{lacking}.*no frame 1002"):
+        composite(tmp_path / "matte", tmp_path / "again", **arguments)
+    run = Run(missing="skip")
+    result = composite(tmp_path / "matte", tmp_path / "again", run=run, **arguments)
+    assert (result.frames, result.skipped) == ([1001], [1002])

@@ -7,8 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.half_floats import rounded, to_float
 from shadowtool.core.trimap import BACKGROUND, FIGURE, UNKNOWN
 
+Float16 = NDArray[np.float16]
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
@@ -24,12 +26,13 @@ class Link(NamedTuple):
     """Where the pixels of a frame are in a neighbouring one.
 
     Attributes:
-        flow: (h, w, 2) float32, displacement (x, y) in pixels.
-        error: (h, w) float32 ≥ 0, by how much the way there and back misses.
+        flow: (h, w, 2) half, displacement (x, y) in pixels; many are kept, and an eighth of a pixel
+            is as good.
+        error: (h, w) half ≥ 0, by how much the way there and back misses.
     """
 
-    flow: Float32
-    error: Float32
+    flow: Float16
+    error: Float16
 
 
 class Carried(NamedTuple):
@@ -74,11 +77,11 @@ def carry(trimap: UInt8, way: Sequence[Link]) -> Carried:
     height, width = trimap.shape
     if not way:
         return Carried(trimap, np.zeros(trimap.shape, np.float32))
-    flow = np.zeros_like(way[0].flow)
-    error = np.zeros_like(way[0].error)
+    flow: Float32 = np.zeros_like(way[0].flow, np.float32)
+    error = np.zeros_like(way[0].error, np.float32)
     for step in way:
-        error += _moved(step.error, flow) + np.float32(_DRIFT)
-        flow += _moved(step.flow, flow)
+        error += _moved(to_float(step.error), flow) + np.float32(_DRIFT)
+        flow += _moved(to_float(step.flow), flow)
     scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
     lost = cv2.resize((error > _LOST).astype(np.uint8), (width, height)) > 0
     error = np.asarray(cv2.resize(error, (width, height)) * scale.max(), np.float32)
@@ -105,8 +108,8 @@ def merge(sides: Sequence[Carried]) -> UInt8:
 
 
 def _checked(forward: Float32, back: Float32) -> Link:
-    missed = forward + _moved(back, forward)
-    return Link(forward, np.asarray(np.linalg.norm(missed, axis=-1), np.float32))
+    missed = np.linalg.norm(forward + _moved(back, forward), axis=-1)
+    return Link(rounded(forward), rounded(missed))
 
 
 def _flow(here: UInt8, there: UInt8) -> Float32:

@@ -8,7 +8,7 @@ import os
 import threading
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -66,12 +66,19 @@ def fingerprinted(paths: Sequence[Path]) -> Iterator[list[str]]:
     Raises:
         InputError, RetryError: as `read_bytes`.
     """
-    known = {path: (_version(path), fingerprint_file(path)) for path in paths}
+    known = {path: _known_as(path, _version(path)) for path in paths}
     before, _known.files = _known.files, known
     try:
         yield [known[path][1] for path in paths]
     finally:
         _known.files = before
+
+
+@lru_cache(128)
+def _known_as(path: Path, version: _Version) -> tuple[_Version, str]:
+    """A file of this version with its fingerprint. Frames that many others are made of, as those
+    on the way to a keyframe, are read once."""
+    return version, fingerprint_file(path)
 
 
 class File:

@@ -24,8 +24,10 @@ UInt8 = NDArray[np.uint8]
 # What is nearly black or white in a trimap. Grey stays grey, 0.21, if a program has taken it for
 # sRGB-encoded and made it linear.
 _BLACK, _WHITE = 0.1, 0.9
-# From further away nothing comes through, and no more links are kept for the next frames.
+# From further away nothing comes through. A frame's links lead as far to either side, and the next
+# frame's are the same but for one.
 _FURTHEST = 24
+_NEXT = 8
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Keyframes:
 
         # Where damage is an error, reading for the links says so.
         passed = readable if missing == "skip" else lambda frame: True
-        return cls(drawn, footage, lru_cache(_FURTHEST)(between), passed)
+        return cls(drawn, footage, lru_cache(2 * _FURTHEST + _NEXT)(between), passed)
 
     def sources(self, frame: Frame) -> list[Path]:
         """What a frame's trimap is made of."""

@@ -66,7 +66,7 @@ def test_the_further_it_is_carried_the_less_is_known() -> None:
 
 def test_every_step_adds_to_the_error() -> None:
     shape = SCENE.lit.shape[:2]
-    still = Link(np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
+    still = Link(np.zeros((*shape, 2), np.float16), np.zeros(shape, np.float16))
     one, many = carry(drawn(0), [still]), carry(drawn(0), [still] * 8)
     assert (many.error > one.error).all()
     assert (one.trimap == UNKNOWN).sum() < (many.trimap == UNKNOWN).sum()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from shadowtool.core.trimap import BACKGROUND, FIGURE
+from shadowtool.core.trimap_flow import Link, links
 from shadowtool.errors import InputError
 from shadowtool.io.image import Header, decode, read_image, write_exr, write_png
 from shadowtool.io.sequence import open_sequence
@@ -120,6 +121,29 @@ def test_keyframes_give_the_same_bits_whatever_the_jobs_and_the_split(
     parts = whole.parent / "parts"
     for folder in ("trimap", "fg", "beta"):
         assert tree(parts / folder) == tree(whole / folder)
+
+
+@pytest.mark.parametrize("spacing", [5, 40])
+def test_each_flow_between_keyframes_is_found_once(
+    take: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spacing: int
+) -> None:
+    for folder in ("source", "drawn"):
+        (tmp_path / folder).mkdir()
+    numbers = range(1001, 1002 + spacing)
+    for number in numbers:
+        shutil.copy(take / "source" / "source.1001.exr", tmp_path / f"source/source.{number}.exr")
+    for number in (numbers[0], numbers[-1]):
+        write_png(tmp_path / "drawn" / f"trimap.{number}.png", drawn(1002))
+    found = []
+
+    def counted(here: np.ndarray, there: np.ndarray) -> tuple[Link, Link]:
+        found.append(1)
+        return links(here, there)
+
+    monkeypatch.setattr("shadowtool.steps.keyframes.links", counted)
+    options = {"plates": take / "plates", "trimap": tmp_path / "drawn", "only": "trimap"}
+    matte(tmp_path / "source", tmp_path / "out", run=Run(jobs=1), **options)
+    assert len(found) == spacing
 
 
 def test_trimaps_are_carried_past_a_damaged_frame(take: Path, tmp_path: Path) -> None:

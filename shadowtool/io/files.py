@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import fcntl
 import io
 import itertools
 import os
@@ -197,9 +198,11 @@ def write_bytes(path: Path, data: bytes | memoryview) -> None:
     temporary = path.parent / f"{_PREFIX}{_HOST}-{os.getpid()}-{_name()}.tmp"
     try:
         try:
-            with temporary.open("xb") as file:
-                file.write(data)
-            temporary.replace(path)
+            with contextlib.ExitStack() as until_renamed:
+                with temporary.open("xb") as file:
+                    until_renamed.enter_context(_in_use(temporary))
+                    file.write(data)
+                temporary.replace(path)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
@@ -271,11 +274,34 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
         for leftover in path.glob(f"{_PREFIX}{_HOST}-*.tmp"):
             if not _alive(leftover.name.removeprefix(f"{_PREFIX}{_HOST}-").split("-")[0]):
-                leftover.unlink(missing_ok=True)
+                _sweep(leftover)
     except FileExistsError:
         raise ShadowtoolError(f"{path}: a file stands where the output folder should be") from None
     except OSError as error:
         raise translated(error, path, "write") from None
+
+
+@contextlib.contextmanager
+def _in_use(temporary: Path) -> Iterator[bool]:
+    """Lock a file; False if it is locked already.
+
+    A container's processes are seen by nobody else: the lock says that one is writing.
+    """
+    with temporary.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            # Some network file systems know no locks; there the process alone has to tell.
+            yield error.errno not in (errno.EAGAIN, errno.EACCES)
+        else:
+            yield True
+
+
+def _sweep(leftover: Path) -> None:
+    """Remove a temporary that nobody is writing."""
+    with contextlib.suppress(OSError), _in_use(leftover) as free:
+        if free:
+            leftover.unlink(missing_ok=True)
 
 
 def _alive(pid: str) -> bool:

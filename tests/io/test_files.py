@@ -1,6 +1,7 @@
 """Files appear whole or not at all."""
 
 import errno
+import fcntl
 import io
 import os
 import socket
@@ -217,6 +218,16 @@ def test_leftovers_of_living_processes_stay(tmp_path):
     make_folder(tmp_path)
     assert mine.exists()
     assert other.exists()
+
+
+def test_what_a_process_that_is_not_seen_is_writing_stays(tmp_path):
+    hidden = leftover(tmp_path, dead_process())
+    with hidden.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        make_folder(tmp_path)
+        assert hidden.exists()
+    make_folder(tmp_path)
+    assert not hidden.exists()
 
 
 def test_leftovers_of_other_machines_stay(tmp_path):

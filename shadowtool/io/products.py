@@ -47,6 +47,10 @@ MANIFEST = "shadowtool.json"
 LINES = "lines.json"
 SCAN = "scan.exr"
 WARP = "warp.exr"
+# Folders of frames, and what their files are called.
+HOLDOUT_FOLDER, TRIMAP_FOLDER, FIGURE_FOLDER, BETA_FOLDER = "holdout", "trimap", "fg", "beta"
+# Those that lie where the plates see the scene from, by the step that writes them.
+_IN_PLACE = {"plate": (HOLDOUT_FOLDER,), "matte": (TRIMAP_FOLDER, FIGURE_FOLDER)}
 
 # In pictures' widths or heights, from the middle.
 _FAR_OUTSIDE = 2.0
@@ -286,6 +290,13 @@ def map_place(path: Path) -> Path:
 def made_by(header: Header) -> str:
     """The step of ours that wrote a file; nothing if it doesn't say."""
     return "".join(header.provenance.get("command", "").split()[1:2])
+
+
+def in_place(image: Path, header: Header) -> bool:
+    """Whether a matte is one of ours, which lie where the plates see the scene from: by what the
+    file says of itself, or, as a paint program drops that, by the folder that it lies in."""
+    step = made_by(header) or read_record(image.parent.parent / MANIFEST).get("step")
+    return step in _IN_PLACE and (bool(made_by(header)) or image.parent.name in _IN_PLACE[step])
 
 
 def read_warp(path: Path) -> tuple[WarpMap, Header, str]:

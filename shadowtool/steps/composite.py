@@ -29,10 +29,16 @@ from shadowtool.io.image import (
     write_exr,
     write_png,
 )
-from shadowtool.io.products import made_by, map_place, read_plates, read_warp
+from shadowtool.io.products import (
+    BETA_FOLDER,
+    FIGURE_FOLDER,
+    made_by,
+    map_place,
+    read_plates,
+    read_warp,
+)
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import require_frames, require_size, say_taken_as, select_from
-from shadowtool.steps.matte import BETA_FOLDER, FIGURE_FOLDER
 from shadowtool.steps.run import (
     Figures,
     FrameWork,

@@ -21,16 +21,13 @@ from shadowtool.core.noise import (
 from shadowtool.core.trembling import UNSTEADY, strips
 from shadowtool.errors import DamagedFileError, InputError
 from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
-from shadowtool.io.products import made_by
+from shadowtool.io.products import in_place
 from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
 
 logger = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
-
-# Steps whose mattes lie where the plates see the scene from.
-_IN_PLACE = ("plate", "matte")
 
 
 class Survey(NamedTuple):
@@ -149,16 +146,18 @@ def open_footage(
     return Footage(sequence, first, resolve_transfer(transfer, next(iter(sequence.files.values()))))
 
 
-def moved_with(values: NDArray[np.floating], header: Header, place: Place) -> NDArray[np.floating]:
+def moved_with(
+    values: NDArray[np.floating], path: Path, header: Header, place: Place
+) -> NDArray[np.floating]:
     """A frame's matte, moved as the frame is: mattes from elsewhere lie where the camera saw the
     frame. Those of our own steps were made of frames that had been moved.
 
     Args:
         values: (H, W).
-        header: of the matte's file.
+        path, header: the matte's file.
         place: as of `Footage.off`.
     """
-    return values if made_by(header) in _IN_PLACE else displaced(values, place)
+    return values if in_place(path, header) else displaced(values, place)
 
 
 def say_assumed(footage: Footage, transfer: str) -> None:

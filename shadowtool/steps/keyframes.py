@@ -95,8 +95,8 @@ class Keyframes:
         whole = merge(sides)
         if place == (0.0, 0.0):
             return whole
-        header = read_header(self.drawn.path(keys[0]))
-        moved = moved_with(whole / np.float32(FIGURE), header, place)
+        path = self.drawn.path(keys[0])
+        moved = moved_with(whole / np.float32(FIGURE), path, read_header(path), place)
         return _three_levels(moved, 1 / 4, 3 / 4)
 
     def _keys(self, frame: Frame) -> list[Frame]:

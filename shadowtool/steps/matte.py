@@ -42,7 +42,7 @@ from shadowtool.core.trimap import FIGURE
 from shadowtool.errors import InputError, OptionError
 from shadowtool.io.files import real
 from shadowtool.io.image import EXR, PNG, Header, Image, read_image, to_half, write_exr, write_png
-from shadowtool.io.products import made_by, read_plates
+from shadowtool.io.products import BETA_FOLDER, FIGURE_FOLDER, TRIMAP_FOLDER, made_by, read_plates
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import (
     Footage,
@@ -71,10 +71,9 @@ _NONE = Box(slice(0, 0), slice(0, 0))
 # A figure larger than this part of the picture is none.
 _TOO_MUCH = 0.5
 
-FIGURE_FOLDER, BETA_FOLDER = "fg", "beta"
 # Each product's folder, also its files' name, and their suffix.
 PRODUCTS: dict[Only, tuple[str, str]] = {
-    "trimap": ("trimap", PNG),
+    "trimap": (TRIMAP_FOLDER, PNG),
     "alpha": (FIGURE_FOLDER, EXR),
     "beta": (BETA_FOLDER, EXR),
 }
@@ -405,7 +404,7 @@ class _Take:
                     f"{stored.path}: is the β that matte wrote, no figure; give the frames in"
                     f" {FIGURE_FOLDER}/"
                 )
-            matte = moved_with(_matte_plane(stored), stored.header, shown.moved)
+            matte = moved_with(_matte_plane(stored), stored.path, stored.header, shown.moved)
             matte = np.clip(matte, 0, 1).astype(np.float32, copy=False)
             box = around(matte > 0, MARGIN) or _NONE
             alpha, image = matte[box].copy(), shown.at(box)

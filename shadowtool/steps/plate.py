@@ -52,7 +52,7 @@ from shadowtool.core.trembling import UNSTEADY, strips, tremble
 from shadowtool.errors import DamagedFileError, InputError, MissingError, OptionError
 from shadowtool.io.files import fingerprint_file, make_folder, new_folders, real
 from shadowtool.io.image import PNG, Image, read_image, write_exr, write_png
-from shadowtool.io.products import MANIFEST, confidence_layers, plate_files
+from shadowtool.io.products import HOLDOUT_FOLDER, MANIFEST, confidence_layers, plate_files
 from shadowtool.io.sequence import Frame, Sequence, frame_file, frame_range, open_sequence
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import (
@@ -84,7 +84,6 @@ logger = logging.getLogger(__name__)
 
 Bool = NDArray[np.bool_]
 
-HOLDOUT_FOLDER = "holdout"
 UNDER_A_CARD = "a scene under a card"
 # Of a scene under a card less than this part in its shadow is worth a word.
 _WELL_SHADED = 0.9
@@ -422,7 +421,7 @@ class _Take:
                 if self.held is not None:
                     matte = self._given(self.held.path(frame))
                     marks.append(matte.fingerprint)
-                    holdout = moved_with(matte.plane("A", "Y"), matte.header, place)
+                    holdout = moved_with(matte.plane("A", "Y"), matte.path, matte.header, place)
                 elif self.background is not None:
                     holdout = self.automatic(frame, grid, last)
                     if last:

@@ -373,6 +373,21 @@ def test_a_holdout_that_is_given_is_moved_with_its_frame(tmp_path: Path) -> None
     assert np.median(frames[(inside > 22) & (inside < 26)]) == 16
 
 
+def test_a_trimap_of_ours_that_was_corrected_lies_where_it_was_written(tmp_path: Path) -> None:
+    """A paint program drops what the file said of itself; its folder still tells."""
+    take, _ = trembling_take(tmp_path, 0.2)
+    plates, out = tmp_path / "plates", tmp_path / "matte"
+    plate(take, plates)
+    matte(take, out, plates=plates, only="trimap")
+    corrected = np.zeros((240, 320), np.uint8)
+    corrected[100:140, 150:170] = 255
+    path = out / f"trimap/trimap.{FIRST + 3}.png"
+    assert cv2.imwrite(str(path), corrected)
+    matte(take, tmp_path / "again", plates=plates, trimap=out / "trimap", only="trimap")
+    again = read_image(tmp_path / f"again/trimap/{path.name}").layers["Y"]
+    assert np.array_equal(again, corrected)
+
+
 def test_a_moved_frame_is_the_same_in_any_chunk(tmp_path: Path) -> None:
     take, _ = trembling_take(tmp_path, 0.2)
     plate(take, tmp_path / "plates")

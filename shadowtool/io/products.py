@@ -9,6 +9,7 @@ import json
 import logging
 import math
 import os
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -290,6 +291,17 @@ def map_place(path: Path) -> Path:
 def made_by(header: Header) -> str:
     """The step of ours that wrote a file; nothing if it doesn't say."""
     return "".join(header.provenance.get("command", "").split()[1:2])
+
+
+def holds_codes(header: Header) -> bool | None:
+    """Whether a step of ours wrote code values for light, as it was told to take a PNG's as they
+    are; None if the file doesn't say."""
+    try:
+        words = shlex.split(header.provenance.get("command", ""))
+        taken = words[words.index("--transfer") + 1]
+    except (ValueError, IndexError):
+        return None
+    return taken == "none" and any(word.lower().endswith(PNG) for word in words)
 
 
 def in_place(image: Path, header: Header) -> bool:

@@ -1,5 +1,6 @@
 """The figure and its shadow in the target scene."""
 
+import contextlib
 import logging
 from collections.abc import Iterable
 from dataclasses import replace
@@ -23,6 +24,7 @@ from shadowtool.io.image import (
     PNG,
     Header,
     Image,
+    read_header,
     read_image,
     resolve_transfer,
     to_code,
@@ -32,13 +34,20 @@ from shadowtool.io.image import (
 from shadowtool.io.products import (
     BETA_FOLDER,
     FIGURE_FOLDER,
+    holds_codes,
     made_by,
     map_place,
     read_plates,
     read_warp,
 )
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
-from shadowtool.steps.footage import require_frames, require_size, say_taken_as, select_from
+from shadowtool.steps.footage import (
+    require_frames,
+    require_size,
+    say_mixed,
+    say_taken_as,
+    select_from,
+)
 from shadowtool.steps.run import (
     Figures,
     FrameWork,
@@ -96,6 +105,10 @@ def composite(
     say_taken_as(plates, stored.transfer)
     figure_transfer = resolve_transfer("auto", figure_frames.path(figure_frames.frames[0]))
     say_taken_as(figure_frames.pattern, figure_transfer)
+    with contextlib.suppress(InputError):
+        # A damaged one is skipped, or refused, in its turn.
+        first = read_header(next(iter(figure_frames.files.values())))
+        say_mixed(plates, stored.header, figure_frames.pattern, holds_codes(first))
     lit, shadow, repaired = _complete(stored.plates.lit, stored.plates.shadow)
     header = stored.header
     for sequence in (figure_frames, beta_frames):

@@ -20,8 +20,8 @@ from shadowtool.core.noise import (
 )
 from shadowtool.core.trembling import UNSTEADY, strips
 from shadowtool.errors import DamagedFileError, InputError
-from shadowtool.io.image import Header, Image, read_header, read_image, resolve_transfer
-from shadowtool.io.products import in_place
+from shadowtool.io.image import PNG, Header, Image, read_header, read_image, resolve_transfer
+from shadowtool.io.products import holds_codes, in_place
 from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
 
@@ -54,6 +54,12 @@ class Footage:
     header: Header
     transfer: str
     vantage: Vantage | None = None
+
+    @property
+    def of_codes(self) -> bool:
+        """Whether a PNG's code values are taken as they are."""
+        first = next(iter(self.sequence.files.values()))
+        return self.transfer == "none" and first.suffix.lower() == PNG
 
     def image(self, frame: Frame, apart: bool = False) -> Image:
         """Read a frame.
@@ -170,6 +176,25 @@ def say_taken_as(name: object, transfer: str, remedy: str = "write it as EXR if 
     """The same of any picture for which no transfer function was given."""
     if transfer != "linear":
         logger.warning("%s: PNG is taken as %s; %s", name, transfer, remedy)
+
+
+def say_mixed(plates: object, header: Header, name: object, codes: bool | None) -> None:
+    """Say that plates hold light and frames code values, or the other way round.
+
+    Args:
+        header: of the plates.
+        name, codes: of what is put together with them; None unknown, and then nothing is said.
+    """
+    own = holds_codes(header)
+    if codes is not None and own is not None and codes != own:
+        kinds = "light", "code values (--transfer none)"
+        logger.warning(
+            "%s: holds %s, but %s is taken as %s; make both with the same --transfer",
+            plates,
+            kinds[own],
+            name,
+            kinds[codes],
+        )
 
 
 def say_flickers(footage: Footage, bands: float) -> None:

@@ -52,6 +52,7 @@ from shadowtool.steps.footage import (
     require_size,
     say_assumed,
     say_flickers,
+    say_mixed,
     say_taken_as,
 )
 from shadowtool.steps.keyframes import Keyframes
@@ -121,6 +122,7 @@ def matte(
     if transfer == "auto":
         say_taken_as(plates, stored.transfer)
     require_size(plates, stored.header, footage.header, footage.sequence.pattern)
+    say_mixed(plates, stored.header, footage.sequence.pattern, footage.of_codes)
     if alpha is not None and (trimap is not None or only == "trimap"):
         raise OptionError("--alpha needs no trimaps; give it without --trimap and --only trimap")
     given = {

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -213,6 +214,28 @@ def test_what_code_values_are_taken_for_is_said(
     assert "taken as" not in caplog.text
     plate(tmp_path / "take", tmp_path / "assumed")
     assert "PNG is taken as srgb" in caplog.text
+
+
+def test_light_and_code_values_are_not_mixed_without_a_word(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "take").mkdir()
+    for number in range(1001, 1007):
+        picture = np.full((HEIGHT, WIDTH, 3), 40 * (number % 3) + 60, np.uint8)
+        write_png(tmp_path / "take" / f"take.{number}.png", picture)
+    taken = ("none", "srgb")
+    for plates_as in taken:
+        plate(tmp_path / "take", tmp_path / plates_as, transfer=plates_as)
+    for plates_as, frames_as in product(taken, taken):
+        caplog.clear()
+        out = tmp_path / f"{plates_as}-{frames_as}"
+        matte(tmp_path / "take", out, plates=tmp_path / plates_as, transfer=frames_as)
+        assert ("the same --transfer" in caplog.text) == (plates_as != frames_as)
+    for mattes_as, plates_as in product(taken, taken):
+        caplog.clear()
+        out = tmp_path / f"composite-{mattes_as}-{plates_as}"
+        composite(tmp_path / f"{mattes_as}-{mattes_as}", out, plates=tmp_path / plates_as)
+        assert ("the same --transfer" in caplog.text) == (plates_as != mattes_as)
 
 
 def test_a_take_without_shadow_is_told_of(

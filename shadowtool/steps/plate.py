@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -70,6 +71,7 @@ from shadowtool.steps.run import (
     Recipe,
     Result,
     Run,
+    left_out,
     refuse_existing,
     refuse_inputs,
     refuse_other_step,
@@ -168,34 +170,12 @@ def plate(
     }
     recipe = Recipe("plate", parameters, inputs)
     if run.resume:
-
-        def fingerprints(frame: Frame) -> list[str]:
-            try:
-                read = [sequence.path(frame) for sequence in (footage.sequence, held) if sequence]
-                return [fingerprint_file(path) for path in read]
-            except MissingError:
-                if run.missing == "skip":
-                    return []
-                raise
-
-        known = dict(zip(frames, ordered_map(fingerprints, frames, run.jobs), strict=True))
-        mark = recipe.fingerprint([*shared, *chain.from_iterable(known.values())])
-        figures = unchanged(output, plate_files(output), mark)
-        used = [frame for frame in frames if known[frame]]
-
-        def held_out(frame: Frame) -> bool:
-            try:
-                header = read_image(_place(output / HOLDOUT_FOLDER, frame)).header
-            except InputError:
-                return False
-            # What has no mark somebody has corrected.
-            own = recipe.fingerprint(known[frame][:1])
-            return header.provenance.get("fingerprint", own) == own
-
-        kept = used if figures and figures.get("held_out") == HOLDOUT_FOLDER else []
-        if figures is not None and all(ordered_map(held_out, kept, run.jobs)):
-            skipped = [*absent, *(frame for frame in frames if not known[frame])]
-            return Result("plate", output, used, len(used), skipped, figures)
+        known = list(ordered_map(partial(_marks, footage.sequence, held, run), frames, run.jobs))
+        figures = _kept(output, recipe, shared, dict(zip(frames, known, strict=True)), run.jobs)
+        if figures is not None:
+            skipped = left_out(figures)
+            used = [frame for frame in frames if frame not in skipped]
+            return Result("plate", output, used, len(used), [*absent, *skipped], figures)
     take = _Take(
         footage,
         run,
@@ -223,10 +203,13 @@ def plate(
     if unseen:
         part = 100 * unseen / pixels
         logger.warning("%s: %d pixels (%.2f%%) were seen in no frame", output, unseen, part)
-    mark = recipe.fingerprint([*shared, *take.marks])
+    marks = {frame: _marks(footage.sequence, held, run, frame) for frame in take.skipped}
+    marks |= take.marks
+    mark = recipe.fingerprint([*shared, *chain.from_iterable(marks[frame] for frame in frames)])
     provenance = recipe.provenance(mark)
     figures = {
         "frames": len(take.used),
+        "skipped": frame_range(take.skipped),
         "held_out": take.held_out(),
         "pixels": pixels,
         "unseen": unseen,
@@ -250,29 +233,72 @@ def plate(
         pass
     if take.trembling is not None:
         figures["trembling"] = round(take.trembling, 3)
-        if take.trembling > UNSTEADY:
-            cure = "--steady auto" if estimator == "robust" else "--estimator robust"
-            logger.warning(
-                "%s: the camera trembles by %.2f pixels; %s",
-                footage.sequence.pattern,
-                take.trembling,
-                "frames are moved to one place"
-                if take.footage.vantage is not None
-                else f"plates are off where texture is strong; hold it firmly, or give {cure}",
-            )
-    say_flickers(footage, take.bands)
+    _advise(figures, take, estimator)
+    warn_of_left(_other_holdouts(output / HOLDOUT_FOLDER, take, held))
+    write_manifest(output, recipe, mark, figures)
+    return Result("plate", output, take.used, 0, [*absent, *take.skipped], figures)
+
+
+def _marks(sequence: Sequence, held: Sequence | None, run: Run, frame: Frame) -> list[str]:
+    """Fingerprints of a frame and its holdout; none for one that is missing and may be."""
+    try:
+        return [fingerprint_file(each.path(frame)) for each in (sequence, held) if each]
+    except MissingError:
+        if run.missing == "skip":
+            return []
+        raise
+
+
+def _kept(
+    output: Path, recipe: Recipe, shared: list[str], known: dict[Frame, list[str]], jobs: int | None
+) -> Figures | None:
+    """The figures of an earlier run, if all that it wrote is there and up to date.
+
+    Args:
+        shared, known: fingerprints of what all frames depend on, and of the frames, as of `_marks`.
+    """
+    mark = recipe.fingerprint([*shared, *chain.from_iterable(known.values())])
+    figures = unchanged(output, plate_files(output), mark)
+    if figures is None or figures.get("held_out") != HOLDOUT_FOLDER:
+        return figures
+
+    def held_out(frame: Frame) -> bool:
+        try:
+            header = read_image(_place(output / HOLDOUT_FOLDER, frame)).header
+        except InputError:
+            return False
+        # What has no mark somebody has corrected.
+        own = recipe.fingerprint(known[frame][:1])
+        return header.provenance.get("fingerprint", own) == own
+
+    skipped = left_out(figures)
+    used = [frame for frame in known if frame not in skipped]
+    return figures if all(ordered_map(held_out, used, jobs)) else None
+
+
+def _advise(figures: Figures, take: "_Take", estimator: Estimator) -> None:
+    """Say what a crew should know of its take."""
+    name = take.footage.sequence.pattern
+    if take.trembling is not None and take.trembling > UNSTEADY:
+        cure = "--steady auto" if estimator == "robust" else "--estimator robust"
+        logger.warning(
+            "%s: the camera trembles by %.2f pixels; %s",
+            name,
+            take.trembling,
+            "frames are moved to one place"
+            if take.footage.vantage is not None
+            else f"plates are off where texture is strong; hold it firmly, or give {cure}",
+        )
+    say_flickers(take.footage, take.bands)
     if figures.get("shaded") == 0:
-        logger.warning("%s: no shadow moves over the scene", footage.sequence.pattern)
+        logger.warning("%s: no shadow moves over the scene", name)
     elif figures.get("read_as") == UNDER_A_CARD and figures["shaded"] < _WELL_SHADED:
         logger.warning(
             "%s: %.0f%% of the picture never got darker; what is as bright as lit ground counts as"
             " missed by the card, the rest as in shade; if there was no card, give --read-as plane",
-            footage.sequence.pattern,
+            name,
             100 * (1 - figures["shaded"]),
         )
-    warn_of_left(_other_holdouts(output / HOLDOUT_FOLDER, take, held))
-    write_manifest(output, recipe, mark, figures)
-    return Result("plate", output, take.used, 0, [*absent, *take.skipped], figures)
 
 
 def _nothing_seen(take: "_Take") -> str:
@@ -364,7 +390,7 @@ class _Take:
     not_finite: dict[str, int] = field(default_factory=dict)
     used: list[Frame] = field(default_factory=list)
     skipped: list[Frame] = field(default_factory=list)
-    marks: list[str] = field(default_factory=list)
+    marks: dict[Frame, list[str]] = field(default_factory=dict)
 
     def held_out(self) -> str:
         """What was left out, in a word or two."""
@@ -465,7 +491,7 @@ class _Take:
                 self.skipped.append(frames[position])
             else:
                 self.used.append(frames[position])
-                self.marks += item.marks
+                self.marks[frames[position]] = item.marks
                 if not is_one(item.gain):
                     self.gains[str(frames[position])] = round(level_of(item.gain), 6)
                     self.bands = max(self.bands, round(unevenness(item.gain), 4))

@@ -15,7 +15,7 @@ from shadowtool.errors import InputError, MissingError, OptionError, OutputExist
 from shadowtool.io.files import fingerprinted, is_file, new_folders, real, size_of
 from shadowtool.io.image import EXR, PNG, read_image
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
-from shadowtool.io.sequence import Frame, frame_number, frame_range
+from shadowtool.io.sequence import Frame, frame_number, frame_range, parse_frames
 from shadowtool.parallel import ordered_map
 
 logger = logging.getLogger(__name__)
@@ -381,6 +381,14 @@ def unchanged(output: Path, products: Iterable[Path], mark: str) -> Figures | No
     # Written anew, so that make sees that the step has been looked after.
     write_json(output / MANIFEST, manifest)
     return figures
+
+
+def left_out(figures: Figures) -> list[Frame]:
+    """The frames that a step with one result recorded as skipped."""
+    try:
+        return parse_frames(figures["skipped"])
+    except (KeyError, AttributeError, OptionError):
+        return []
 
 
 def write_manifest(

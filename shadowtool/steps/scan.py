@@ -53,6 +53,7 @@ from shadowtool.steps.run import (
     Recipe,
     Result,
     Run,
+    left_out,
     refuse_existing,
     refuse_inputs,
     refuse_other_step,
@@ -136,10 +137,11 @@ def scan(
     if run.resume:
         paths = [footage.sequence.path(frame) for frame in frames]
         known = dict(zip(frames, ordered_map(fingerprint_file, paths, run.jobs), strict=True))
-        mark = _mark(recipe, plane_mark, known)
-        figures = unchanged(output, products, mark)
+        figures = unchanged(output, products, _mark(recipe, plane_mark, known))
         if figures is not None:
-            return Result("scan", output, frames, len(frames), absent, figures)
+            skipped = left_out(figures)
+            used = [frame for frame in frames if frame not in skipped]
+            return Result("scan", output, used, len(used), [*absent, *skipped], figures)
     reading = _crossings(footage, frames, gain, run)
     trembling = reading.trembling
     if steady == "auto" and trembling > UNSTEADY:
@@ -152,7 +154,7 @@ def scan(
     del reading
     warn_of_nan(output, bad)
     used = list(gains)
-    skipped = [*absent, *(frame for frame in frames if frame not in used)]
+    skipped = [frame for frame in frames if frame not in used]
     numbers = np.array([float(frame) for frame in used])
     if numbers[-1] > _FEW_DIGITS:
         logger.warning(
@@ -169,7 +171,9 @@ def scan(
             used[before],
             used[before + 1],
         )
-    mark = _mark(recipe, plane_mark, dict(zip(used, marks, strict=True)))
+    known = {frame: fingerprint_file(footage.sequence.path(frame)) for frame in skipped}
+    known |= dict(zip(used, marks, strict=True))
+    mark = _mark(recipe, plane_mark, {frame: known[frame] for frame in frames})
     provenance = recipe.provenance(mark)
     with meanwhile(
         lambda: encode_times(output, times, region, footage.header, provenance)
@@ -186,6 +190,7 @@ def scan(
             bend = line_bend(points, numbers, lines, footage.header.size)
             off = off_lines(times.time, region, lines) > _OFF
             figures = _figures(times, lines, region, gains, bend) | {
+                "skipped": frame_range(skipped),
                 "errors_raised": round(raised, 2),
                 "trembling": round(trembling, 3),
                 "off_lines": round(float(off.mean()), 4) if off.size else 0.0,
@@ -194,7 +199,7 @@ def scan(
             write_scan(output, Pass(times, lines, region), footage.header, provenance, encoded())
             drawn()
     write_manifest(output, recipe, mark, figures)
-    return Result("scan", output, used, 0, skipped, figures)
+    return Result("scan", output, used, 0, [*absent, *skipped], figures)
 
 
 def _mark(recipe: Recipe, plane: str, frames: dict[Frame, str]) -> str:

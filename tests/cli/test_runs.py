@@ -554,6 +554,26 @@ def test_every_chunk_is_held_against_the_first_frame_of_all(jolted, command, tmp
     assert "first seen in frame 1004" in outcome.err
 
 
+@pytest.mark.parametrize(("name", "bad"), [("plate", 1004), ("scan", 1020)])
+def test_a_result_without_a_damaged_frame_is_kept_and_says_so(name, bad, shot, command, tmp_path):
+    words = shot.arguments(name)
+    take = tmp_path / Path(words[1]).name
+    shutil.copytree(words[1], take)
+    file = take / f"{take.name}.{bad}.exr"
+    file.write_bytes(file.read_bytes()[:-30])
+    words = [*replaced(words, 1, take), "-o", tmp_path / "out", "--missing", "skip"]
+    for again in ([], ["--resume"]):
+        outcome = command(*words, *again)
+        assert outcome.code == 3, outcome.err
+        assert f"SKIPPED {bad}" in outcome.out
+    assert "up to date" in outcome.out
+    record = json.loads((tmp_path / "out" / "shadowtool.json").read_text())
+    assert record["figures"]["skipped"] == str(bad)
+    # Another damaged file is another input.
+    file.write_bytes(file.read_bytes()[:-30])
+    assert "up to date" not in command(*words, "--resume").out
+
+
 def test_resume_of_plates_without_a_holdout_that_is_missing(shot, command, copied, tmp_path):
     mattes = copied("matte") / "fg"
     for number in range(1007, 1013):

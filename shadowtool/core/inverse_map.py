@@ -5,10 +5,13 @@ map leads to that plane too; the source's, taken backwards, leads on to the pixe
 source shows that shadow.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import bands
 from shadowtool.core.warp_map import WarpMap, identity_map
 
 Float32 = NDArray[np.float32]
@@ -32,15 +35,44 @@ def invert(warp_map: WarpMap) -> WarpMap:
         pixel shows the point. Its error is that of the pixel's own W.
     """
     height, width = warp_map.error.shape
-    if height < 2 or width < 2:
-        return WarpMap(
-            np.full((height, width, 2), np.nan, np.float32),
-            np.full((height, width), np.inf, np.float32),
-        )
-    place = identity_map(height, width).reshape(-1, 2).astype(np.float64)
-    shown = warp_map.warp.reshape(-1, 2).astype(np.float64)
-    error = warp_map.error.ravel().astype(np.float64)
-    corners = _triangles(height, width)
+    warp = np.full((height * width, 2), np.nan, np.float32)
+    error = np.full(height * width, np.inf, np.float32)
+    if height > 1 and width > 1:
+        for rows in bands((height - 1, width)):
+            found = _turned_round(warp_map, rows)
+            # The best known of each cell comes last; of equals, the first pixel's.
+            y, x = -found.place[:, 1], -found.place[:, 0]
+            order = np.lexsort((x, y, -found.error, found.cell))
+            cells = found.cell[order]
+            last = order[np.append(cells[1:] != cells[:-1], True)[: len(order)]]
+            cells, best = found.cell[last], found.error[last]
+            better = (best < error[cells]) | np.isnan(warp[cells, 0])
+            warp[cells[better]], error[cells[better]] = found.place[last[better]], best[better]
+    return WarpMap(warp.reshape(height, width, 2), error.reshape(height, width))
+
+
+class _Points(NamedTuple):
+    """Points of the reference plane that some triangles show.
+
+    Attributes:
+        cell: (N,), the point's number, counted row by row.
+        place: (N, 2), where it is seen, (x, y).
+        error: (N,), the largest of the triangle's corners.
+    """
+
+    cell: NDArray[np.int64]
+    place: Float64
+    error: Float64
+
+
+def _turned_round(warp_map: WarpMap, rows: slice) -> _Points:
+    """What the triangles below some rows of pixels show."""
+    height, width = warp_map.error.shape
+    part = slice(rows.start, rows.stop + 1)
+    place = identity_map(height, width)[part].reshape(-1, 2).astype(np.float64)
+    shown = warp_map.warp[part].reshape(-1, 2).astype(np.float64)
+    error = warp_map.error[part].ravel().astype(np.float64)
+    corners = _triangles(part.stop - part.start, width)
     corner = shown[corners]
     span = corner.max(axis=1) - corner.min(axis=1)
     corners = corners[(span <= _TORN).all(axis=1)]
@@ -50,10 +82,10 @@ def invert(warp_map: WarpMap) -> WarpMap:
     to_first, to_second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     area = to_first[:, 0] * to_second[:, 1] - to_first[:, 1] * to_second[:, 0]
     cells, places, errors = [], [], []
-    columns, rows = (last - first).T
+    columns, below = (last - first).T
     columns[area == 0] = -1
     for row, column in np.ndindex(int(_TORN) + 1, int(_TORN) + 1):
-        some = np.flatnonzero((columns >= column) & (rows >= row))
+        some = np.flatnonzero((columns >= column) & (below >= row))
         point = first[some] + np.array([column, row])
         inside = ((point >= 0) & (point < (width, height))).all(axis=1)
         some, point = some[inside], point[inside]
@@ -68,13 +100,7 @@ def invert(warp_map: WarpMap) -> WarpMap:
         cells.append(point[:, 1] * width + point[:, 0])
         places.append(one + a * (two - one) + b * (three - one))
         errors.append(error[corners[some]].max(axis=1))
-    cell, position, worth = (np.concatenate(parts) for parts in (cells, places, errors))
-    # The best known of each cell comes last, and stays; of equals, the first pixel's.
-    order = np.lexsort((-position[:, 0], -position[:, 1], -worth, cell))
-    warp = np.full((height * width, 2), np.nan, np.float32)
-    found = np.full(height * width, np.inf, np.float32)
-    warp[cell[order]], found[cell[order]] = position[order], worth[order]
-    return WarpMap(warp.reshape(height, width, 2), found.reshape(height, width))
+    return _Points(*(np.concatenate(parts) for parts in (cells, places, errors)))
 
 
 def compose(first: WarpMap, second: WarpMap) -> WarpMap:

@@ -93,3 +93,18 @@ def test_inputs_are_left_alone() -> None:
     compose(warp_map, invert(warp_map))
     assert np.array_equal(warp_map.warp, other.warp)
     assert np.array_equal(warp_map.error, other.error)
+
+
+def test_bands_change_no_bit(narrow_bands) -> None:
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[:60, :80]
+    warp = identity_map(60, 80) + np.dstack([8 * np.sin(y / 9), 5 * np.cos(x / 11)])
+    warp += rng.normal(0, 0.3, warp.shape)
+    warp[rng.random((60, 80)) < 0.02] = np.nan
+    error = rng.choice([0.1, 0.2, np.inf], (60, 80))
+    folded = WarpMap(warp.astype(np.float32), error.astype(np.float32))
+    whole = invert(folded)
+    narrow_bands()
+    narrow = invert(folded)
+    np.testing.assert_array_equal(whole.warp, narrow.warp)
+    np.testing.assert_array_equal(whole.error, narrow.error)

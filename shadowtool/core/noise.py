@@ -139,11 +139,11 @@ class NoiseSamples:
         self._every = 2
         self._count = 0
 
-    def add(self, image: NDArray[np.floating]) -> None:
-        """Take in the next frame, (H, W, 3) linear light."""
+    def add(self, sample: Float32) -> None:
+        """Take in the next frame, thinned, (h, w, 3) linear light."""
         start, place = divmod(self._count, self._every)
         if place < 2:
-            self._kept.setdefault(start * self._every, {})[place] = thin(image)
+            self._kept.setdefault(start * self._every, {})[place] = sample
         self._count += 1
         if len(self._kept) > 2 * _SAMPLES and place == 1:
             self._every *= 2

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from shadowtool.choices import Format
 from shadowtool.core import camera_motion
 from shadowtool.core.half_floats import LARGEST_HALF, not_finite
-from shadowtool.core.noise import NoiseSamples, noise_levels
+from shadowtool.core.noise import NoiseSamples, noise_levels, thin
 from shadowtool.core.resizing import resized
 from shadowtool.core.shadow_time import luminance
 from shadowtool.core.transfer import TRANSFERS
@@ -148,7 +148,7 @@ def capture(
     absent = [f for f in opened.wanted or () if f not in frames and f not in skipped]
     if absent and run.missing == "error":
         raise InputError(
-            f"{opened.name}: has no frames {frame_range(absent)}; its last is {frames[-1]}"
+            f"{opened.name}: has no frames {frame_range(absent)}; its last is {opened.last()}"
         )
     if opened.wanted is None and len(frames) + len(skipped) < opened.total:
         logger.warning(
@@ -157,7 +157,7 @@ def capture(
             opened.total,
             len(frames),
         )
-    record = _record(opened, report, frames, transfer, size)
+    record = recipe.provenance(mark) | _record(opened, report, frames, transfer, size)
     write_json(output / RECORD, record)
     _warn(record, output)
     warn_of_nan(output, report.not_finite)
@@ -180,12 +180,17 @@ def capture(
 class _Measured(NamedTuple):
     """What is kept of a frame once it is written.
 
-    ``mark`` is the fingerprint in its file.
+    Attributes:
+        mark: the fingerprint in its file.
+        thinned: as of `thin`.
+        grid: a few of its pixels, to be compared with the next frame's.
     """
 
-    arriving: Arriving
+    frame: Frame
+    seconds: float | None
     mark: str
-    linear: Float32
+    thinned: Float32
+    grid: Float32
     shift: float | None
     clipped: float
     not_finite: int
@@ -207,12 +212,12 @@ class _Report:
     before: Float32 | None = None
 
     def add(self, measured: _Measured) -> None:
-        frame, seconds = measured.arriving.frame, measured.arriving.seconds
-        self.noise.add(measured.linear)
-        grid = np.clip(np.nan_to_num(measured.linear[::_GRID, ::_GRID]), -1e4, 1e4)
+        frame, seconds = measured.frame, measured.seconds
+        self.noise.add(measured.thinned)
         if self.before is not None:
-            self.likeness.append((frame, float(np.abs(grid - self.before).mean())))
-        self.before = grid
+            self.likeness.append((frame, float(np.abs(measured.grid - self.before).mean())))
+        self.before = measured.grid
+        self.marks[frame] = measured.mark
         self.shifts[str(frame)] = measured.shift
         self.clipped.append(measured.clipped)
         self.not_finite[str(frame)] = measured.not_finite
@@ -280,9 +285,8 @@ class _Taking:
             ordered_map(work, self.source.arriving, self.run.jobs), start=1
         ):
             if isinstance(done, _Measured):
-                frames.append(done.arriving.frame)
+                frames.append(done.frame)
                 report.add(done)
-                report.marks[done.arriving.frame] = done.mark
             else:
                 skipped.append(done)
             self.run.progress(number, max(total, number) if total else 0)
@@ -307,19 +311,25 @@ class _Taking:
         gray = self._prepared(linear)
         shift = None if reference is None else camera_motion.shift(reference, gray, self.size[0])
         top = LARGEST_HALF if self.source.bits is None else _CLIPPED_CODE
-        clipped = float((loaded.values >= top).any(axis=-1).mean())
+        clipped = float((self._cropped(loaded.values) >= top).any(axis=-1).mean())
         bad = not_finite(linear)
         count = 0 if bad is None else int(np.count_nonzero(bad))
-        return _Measured(arriving, mark, linear, shift, clipped, count, kept)
+        grid = np.clip(np.nan_to_num(linear[::_GRID, ::_GRID]), -1e4, 1e4)
+        seen = arriving.frame, arriving.seconds, mark, thin(linear), grid
+        return _Measured(*seen, shift, clipped, count, kept)
 
     @staticmethod
     def _prepared(linear: Float32) -> Float32:
         return camera_motion.prepare(luminance(linear))
 
+    def _cropped(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
+        if (crop := self.crop) is None:
+            return values
+        return values[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
+
     def _linear(self, coded: NDArray[np.floating]) -> Float32:
-        values = TRANSFERS[self.transfer].decode(coded)
-        if (crop := self.crop) is not None:
-            values = values[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
+        """A picture's light, cropped and at the size that is written."""
+        values = TRANSFERS[self.transfer].decode(self._cropped(coded))
         if (values.shape[1], values.shape[0]) != self.size:
             values = resized(values, self.size)
         return values

@@ -15,7 +15,7 @@ from shadowtool.choices import Missing
 from shadowtool.errors import DamagedFileError, InputError, OptionError
 from shadowtool.io.files import fingerprint_file, fingerprint_movie, size_of
 from shadowtool.io.image import EXR, PNG, Header
-from shadowtool.io.sequence import Frame, parse_frames
+from shadowtool.io.sequence import Frame, frame_range, parse_frames
 from shadowtool.io.video import Movie, MovieFrame, camera_frames
 from shadowtool.parallel import ordered_map
 from shadowtool.steps.footage import open_footage
@@ -75,6 +75,7 @@ class Source:
         folder: where a sequence's files are.
         marks: reads the fingerprint of each wanted frame, on so many threads, where a frame is a
             file of its own; else empty.
+        last: the number of the last frame that has arrived, wanted or not; None unknown.
         size_of: how many bytes the file of this frame, wanted or not, has; 0 where frames have no
             files of their own. Raises InputError if there is none.
     """
@@ -92,6 +93,7 @@ class Source:
     absent: list[Frame] = field(default_factory=list)
     folder: Path | None = None
     marks: Callable[[int | None], dict[Frame, str]] = lambda jobs: {}
+    last: Callable[[], Frame | None] = lambda: None
     size_of: Callable[[Frame], int] = lambda frame: 0
 
 
@@ -123,11 +125,11 @@ def open_source(
         raise OptionError("give a movie, a sequence, or --device N --seconds T")
     path = Path(source)
     if path.is_file() and path.suffix.lower() not in (EXR, PNG):
-        return _movie(path, frames, transfer, FIRST_FRAME if start is None else start)
+        return _movie(path, frames, missing, transfer, FIRST_FRAME if start is None else start)
     return _sequence(source, frames, missing, transfer, start)
 
 
-def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
+def _movie(path: Path, frames: str | None, missing: Missing, transfer: str, start: int) -> Source:
     movie = Movie(path)
     info = movie.info
     if info.transfer is None and transfer == "auto":
@@ -137,6 +139,12 @@ def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
         assumed.append(info.assumed_transfer)
     wanted = None if frames is None else parse_frames(frames)
     chosen = None if wanted is None else set(wanted)
+    early = [frame for frame in wanted or () if frame < start]
+    if early and missing == "error":
+        raise InputError(
+            f"{path}: has no frames {frame_range(early)}; its first is {start}, or give --start"
+        )
+    last = start - 1
     mark = fingerprint_movie(path)
     header = Header(
         info.width, info.height, pixel_aspect=info.pixel_aspect, frame_rate=info.frame_rate
@@ -151,8 +159,9 @@ def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
         return Loaded(item.coded, header, f"{mark} {item.position}")
 
     def arriving() -> Iterator[Arriving]:
+        nonlocal last
         for item in movie.frames():
-            frame = start + item.position
+            frame = last = start + item.position
             if chosen is None or frame in chosen:
                 yield Arriving(frame, item.seconds, partial(load, item))
             if chosen is not None and frame >= max(chosen):
@@ -175,6 +184,7 @@ def _movie(path: Path, frames: str | None, transfer: str, start: int) -> Source:
         total=len(wanted) if wanted is not None else info.frames or 0,
         arriving=arriving(),
         earliest=earliest,
+        last=lambda: last,
     )
 
 

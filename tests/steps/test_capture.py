@@ -1,5 +1,6 @@
 """What a take tells of itself when it is captured."""
 
+import json
 from fractions import Fraction
 from pathlib import Path
 
@@ -7,9 +8,10 @@ import av
 import numpy as np
 import pytest
 
-from shadowtool.errors import OptionError
+from shadowtool.errors import InputError, OptionError
 from shadowtool.io.image import write_png
-from shadowtool.steps.capture import capture
+from shadowtool.steps.capture import Crop, capture
+from shadowtool.steps.run import Run
 from tests.conftest import write_frames
 
 
@@ -64,6 +66,8 @@ def test_clipped_code_values_are_told_of_and_what_they_are_taken_for(
     assert result.figures["clipped"] == pytest.approx(8 * 16 / (32 * 64))
     assert "6.2% of the pixels are clipped" in caplog.text
     assert "PNG frames are taken as srgb" in caplog.text
+    below = capture(tmp_path / "take", tmp_path / "below", crop=Crop(64, 24, 0, 8))
+    assert below.figures["clipped"] == 0
 
 
 def test_floats_above_one_are_not_clipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -76,3 +80,29 @@ def test_a_take_is_not_captured_into_its_own_folder(tmp_path: Path) -> None:
     take = write_frames(tmp_path / "take", [drifting(0)])
     with pytest.raises(OptionError, match="folder of the frames to capture"):
         capture(take, take)
+
+
+@pytest.mark.parametrize(
+    ("frames", "said"),
+    [
+        ("990-1003", "has no frames 990-1000; its first is 1001"),
+        ("1002,1009", "has no frames 1009; its last is 1006"),
+    ],
+)
+def test_frames_that_a_movie_does_not_have_are_named(
+    tmp_path: Path, frames: str, said: str
+) -> None:
+    movie = write_movie(tmp_path / "a.mkv", [0, 1, 2, 3, 4, 5])
+    with pytest.raises(InputError, match=said):
+        capture(movie, tmp_path / "out", run=Run(frames=frames))
+    run = Run(frames=frames, missing="skip", overwrite=True)
+    assert capture(movie, tmp_path / "out", run=run).skipped
+
+
+def test_the_record_of_measurements_says_how_it_was_made(tmp_path: Path) -> None:
+    take = write_frames(tmp_path / "take", [drifting(0), drifting(0)])
+    capture(take, tmp_path / "out")
+    record = json.loads((tmp_path / "out" / "capture.json").read_text())
+    manifest = json.loads((tmp_path / "out" / "shadowtool.json").read_text())
+    for key in ("version", "command", "fingerprint"):
+        assert record[key] == manifest[key]

@@ -150,13 +150,17 @@ def scan(
             # There is no room for both readings.
             del reading
             reading = _crossings(footage, readable, gain, run)
+        else:
+            # What moved is not the camera.
+            trembling = 0.0
+            reading = reading._replace(trembling=trembling)
     crossings, noise, remaining, marks, gains, bad, first, _ = reading
     del reading
     warn_of_nan(output, bad)
     used = list(gains)
     skipped = [frame for frame in frames if frame not in used]
     numbers = np.array([float(frame) for frame in used])
-    if numbers[-1] > _FEW_DIGITS:
+    if np.abs(numbers).max() > _FEW_DIGITS:
         logger.warning(
             "%s: frame numbers this large leave float32 times few digits; renumber the take",
             footage.sequence.pattern,
@@ -359,8 +363,8 @@ def _times(
         spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))
         error, own_error = ((e * spacing).astype(np.float32) for e in (error, own_error))
     time, own = _numbers(time, numbers), _numbers(own, numbers)
-    if numbers[-1] > _FEW_DIGITS:
-        step = np.float32(np.spacing(np.float32(numbers[-1])) / np.sqrt(12))
+    if (largest := np.abs(numbers).max()) > _FEW_DIGITS:
+        step = np.float32(np.spacing(np.float32(largest)) / np.sqrt(12))
         error, own_error = np.hypot(error, step), np.hypot(own_error, step)
     return ShadowTimes(time, error, contrast, own, own_error), raised
 

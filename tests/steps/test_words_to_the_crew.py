@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -35,20 +36,43 @@ def test_a_sweep_that_stops_half_way_is_told_of(
     assert "pixels a frame" not in caplog.text
 
 
+@pytest.mark.parametrize("further", [2**22, -(2**22 + 2000)])
 def test_frame_numbers_that_single_floats_hardly_hold_are_told_of(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, further: int
 ) -> None:
     take = shoot(tmp_path / "take", SWEEPS["first"])
     scan(take, tmp_path / "few", plane=PLANE)
     assert "few digits" not in caplog.text
     for path in sorted(take.iterdir()):
-        path.rename(take / f"take.{int(path.name.split('.')[1]) + 2**22}.exr")
+        path.rename(take / f"take.{int(path.name.split('.')[1]) + further}.exr")
     scan(take, tmp_path / "many", plane=PLANE)
     assert "frame numbers this large leave float32 times few digits" in caplog.text
     few, many = (read_scan(tmp_path / name)[0].times for name in ("few", "many"))
     # Times half a frame apart are off by so much for being rounded.
     assert many.error[np.isfinite(many.time)].min() > 0.5 / np.sqrt(12) - 0.01
     assert np.median(few.error[np.isfinite(few.time)]) < 0.05
+
+
+def test_things_that_sway_are_no_camera_that_trembles(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    sweep, rng = SWEEPS["first"], np.random.default_rng(3)
+    (tmp_path / "take").mkdir()
+    for frame in range(SCENE.frames_of(sweep)):
+        image = SCENE.image(SCENE.sweep_beta(sweep, frame)).astype(np.float32)
+        for first in range(0, SCENE.width, SCENE.width // 4):
+            strip = image[:, first : first + SCENE.width // 4]
+            move = np.hstack([np.eye(2), rng.normal(0, 0.8, (2, 1))])
+            size = strip.shape[1::-1]
+            strip[:] = cv2.warpAffine(strip, move, size, borderMode=cv2.BORDER_REFLECT)
+        path = tmp_path / "take" / f"take.{1001 + frame}.exr"
+        noisy = to_half(SCENE.noisy(image, frame))
+        write_exr(path, {"RGB": noisy}, Header(SCENE.width, SCENE.height))
+    scan(tmp_path / "take", tmp_path / "none", plane=PLANE, steady="none")
+    assert "the camera trembles" in caplog.text
+    caplog.clear()
+    scan(tmp_path / "take", tmp_path / "auto", plane=PLANE)
+    assert "the camera trembles" not in caplog.text
 
 
 def test_times_that_differ_by_more_than_noise_are_told_of(

@@ -32,6 +32,10 @@ class ReshootError(ShadowtoolError):
     """The take itself can't give a usable result."""
 
 
+class NoLinesError(ReshootError):
+    """On the reference plane the shadow's edge has no lines that could be told."""
+
+
 class OptionError(ShadowtoolError):
     """An option's value, or a combination of options, makes no sense."""
 

@@ -9,23 +9,46 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import TypeVar
 
 import cv2
 
-# No machine has a number of processors with so many digits.
-_DIGITS = 7
+# No number of processors, and none of microseconds here, has so many digits.
+_DIGITS = 10
+# Microseconds that a container may use of each so many; "max" if it may use all.
+_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 def available_cpus() -> int:
-    """The CPUs that this process may use: what Slurm granted, or the affinity mask."""
-    granted = os.environ.get("SLURM_CPUS_PER_TASK", "")
-    if granted.isascii() and granted.isdigit() and 0 < len(granted) < _DIGITS and int(granted) > 0:
-        return int(granted)
-    return len(os.sched_getaffinity(0))
+    """The CPUs that this process may use: what Slurm granted, or those of the affinity mask, but no
+    more than the share of a container."""
+    granted = _number(os.environ.get("SLURM_CPUS_PER_TASK", ""))
+    if granted:
+        return granted
+    if hasattr(os, "sched_getaffinity"):
+        there = len(os.sched_getaffinity(0))
+    else:
+        there = os.cpu_count() or 1
+    return min(there, _share() or there)
+
+
+def _share() -> int | None:
+    """How many CPUs' time a container has at most, rounded up; None for no limit."""
+    try:
+        quota, period = map(_number, _QUOTA.read_text().split())
+    except (OSError, ValueError):
+        return None
+    return -(-quota // period) if quota and period else None
+
+
+def _number(text: str) -> int:
+    """A number as the system writes it; 0 for what is none."""
+    usual = text.isascii() and text.isdigit() and len(text) < _DIGITS
+    return int(text) if usual else 0
 
 
 @contextlib.contextmanager

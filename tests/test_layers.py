@@ -60,6 +60,15 @@ def test_what_one_module_is_for_no_other_does(library: str, places: set[str]) ->
     assert users == places
 
 
+def test_what_is_raised_on_purpose_stands_in_one_place() -> None:
+    for module in MODULES:
+        classes = [
+            n for n in ast.walk(ast.parse(module.read_text())) if isinstance(n, ast.ClassDef)
+        ]
+        raised = [c.name for c in classes if any("Error" in ast.unparse(b) for b in c.bases)]
+        assert not raised or module.name == "errors.py", module.name
+
+
 def test_core_knows_neither_files_nor_terminals() -> None:
     for module in (PACKAGE / "core").glob("*.py"):
         used = {name.split(".")[0] for name in imports(module)}

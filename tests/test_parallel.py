@@ -163,6 +163,26 @@ def test_without_slurm_the_affinity_mask_counts(monkeypatch):
     assert available_cpus() == 3
 
 
+@pytest.mark.parametrize(
+    ("quota", "cpus"),
+    [("150000 100000", 2), ("20000 100000", 1), ("900000 100000", 3), ("max 100000", 3), ("", 3)],
+)
+def test_a_containers_share_counts(quota, cpus, monkeypatch, tmp_path):
+    monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {1, 4, 5})
+    monkeypatch.setattr("shadowtool.parallel._QUOTA", tmp_path / "cpu.max")
+    (tmp_path / "cpu.max").write_text(quota)
+    assert available_cpus() == cpus
+
+
+def test_where_there_are_no_affinity_masks_all_cpus_count(monkeypatch, tmp_path):
+    monkeypatch.delenv("SLURM_CPUS_PER_TASK", raising=False)
+    monkeypatch.delattr("os.sched_getaffinity")
+    monkeypatch.setattr("shadowtool.parallel._QUOTA", tmp_path / "none")
+    monkeypatch.setattr("os.cpu_count", lambda: 6)
+    assert available_cpus() == 6
+
+
 def test_by_default_as_many_threads_as_cpus_are_used(monkeypatch):
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "3")
     meeting = threading.Barrier(3)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
+from shadowtool.errors import NoLinesError
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -68,10 +69,6 @@ class ShadowLines:
     def angle(self) -> Float64:
         """(F,) direction of the normals, radians, unwrapped."""
         return np.unwrap(np.arctan2(self.normal[:, 1], self.normal[:, 0]))
-
-
-class NoLinesError(ValueError):
-    """The reference plane shows too little of the sweep to fit lines."""
 
 
 def fit_shadow_lines(groups: dict[int, Float64], frames: Float64) -> ShadowLines:

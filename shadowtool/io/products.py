@@ -321,12 +321,9 @@ def read_warp(path: Path) -> tuple[WarpMap, Header, str]:
     st_map = np.stack([image.channel("R"), image.channel("G")], axis=-1)
     _require_st_map(image, st_map)
     height, width = st_map.shape[:2]
-    layer = image.layers.get("RGBA")
-    error = (
-        np.zeros((height, width), np.float32)
-        if layer is None
-        else error_of_confidence(layer[..., 3].astype(np.float32))
-    )
+    error = np.zeros((height, width), np.float32)
+    if "RGBA" in image.layers:
+        error = error_of_confidence(image.channel("A"))
     return WarpMap(from_st_map(st_map, width, height), error), image.header, image.fingerprint
 
 

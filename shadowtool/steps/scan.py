@@ -18,7 +18,6 @@ from shadowtool.core.pictures import display, time_picture
 from shadowtool.core.plane_fits import understated
 from shadowtool.core.shadow_lines import (
     Bend,
-    NoLinesError,
     ShadowLines,
     fit_shadow_lines,
     line_bend,
@@ -40,7 +39,7 @@ from shadowtool.core.shadow_time import (
 )
 from shadowtool.core.trembling import UNSTEADY, strips, tremble
 from shadowtool.core.warp_map import Pass
-from shadowtool.errors import DamagedFileError, InputError, MissingError, ReshootError
+from shadowtool.errors import DamagedFileError, InputError, MissingError, NoLinesError, ReshootError
 from shadowtool.io.files import fingerprint_file, make_folder
 from shadowtool.io.image import write_png
 from shadowtool.io.products import LINES, MANIFEST, SCAN, encode_times, write_scan

@@ -3,7 +3,6 @@ import pytest
 
 from shadowtool.core.shadow_lines import (
     Bend,
-    NoLinesError,
     ShadowLines,
     fit_shadow_lines,
     interpolate_lines,
@@ -13,6 +12,7 @@ from shadowtool.core.shadow_lines import (
     zero_crossings,
 )
 from shadowtool.core.warp_map import identity_map
+from shadowtool.errors import NoLinesError
 from tests.scene import Scene, Sweep
 
 SCENE = Scene()

@@ -479,6 +479,13 @@ def test_maps_of_other_programs_need_no_alpha(names, tmp_path):
     assert (stored.error == 0).all()
 
 
+def test_the_confidence_of_a_map_in_png_is_read_as_in_exr(tmp_path):
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    st_map = [(x + 0.5) / WIDTH, 1 - (y + 0.5) / HEIGHT, 0 * x, 0.25 + 0 * x]
+    write_png(tmp_path / "a.png", np.rint(65535 * np.dstack(st_map)).astype(np.uint16))
+    np.testing.assert_allclose(read_warp(tmp_path / "a.png")[0].error, 3, rtol=1e-3)
+
+
 def test_a_picture_of_one_channel_is_no_map(tmp_path):
     write_exr(tmp_path / "a.exr", {"Y": random(HEIGHT, WIDTH)})
     with pytest.raises(InputError, match=r"a\.exr"):

@@ -9,6 +9,9 @@ import click
 if TYPE_CHECKING:
     from shadowtool.steps.run import Result
 
+# Figures of more frames than this are summed up; --json gives them all.
+_MANY = 8
+
 
 def report(results: Iterable["Result"], as_json: bool) -> None:
     """Print what the steps did."""
@@ -48,7 +51,15 @@ def _headline(row: dict[str, Any]) -> str:
 
 def _text(value: Any) -> str:
     if isinstance(value, dict):
+        if len(value) > _MANY:
+            return f"{len(value)} frames, {_range(value.values())}"
         return ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in value.items()) or "none"
     if isinstance(value, list):
         return ", ".join(map(_text, value)) or "none"
-    return "unknown" if value is None else str(value)
+    return "none" if value is None else str(value)
+
+
+def _range(values: Iterable[Any]) -> str:
+    """Of many frames' figures, numbers or lists of them, from where to where they go."""
+    columns = zip(*(value if isinstance(value, list) else [value] for value in values), strict=True)
+    return ", ".join(f"{min(column):g} to {max(column):g}" for column in columns)

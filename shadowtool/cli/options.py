@@ -39,7 +39,10 @@ output_option = click.option(
     help="Folder to write to; made if it isn't there.",
 )
 frames_option = click.option(
-    "--frames", metavar="RANGE", help="Frames to work on: 1001-1048, 1001-1048x2, 1,5,9-20."
+    "--frames",
+    metavar="RANGE",
+    help="Frames to work on: 1001-1048, 1001-1048x2, 1,5,9-20. plate and scan look at them all"
+    " together; the others make each by itself, so that machines may share them.",
 )
 missing_option = click.option(
     "--missing",

@@ -21,7 +21,7 @@ def reporter(kind: str, name: str) -> Iterator[Advance]:
     elif kind == "plain":
         yield _lines(name)
     elif kind == "openjd":
-        yield _openjd
+        yield _openjd()
     else:
         yield lambda done, total: None
 
@@ -52,7 +52,14 @@ def _lines(name: str) -> Advance:
     return advance
 
 
-def _openjd(done: int, total: int) -> None:
-    # Open Job Description reads a task's progress from its output, in per cent.
-    part = 100 * done / total if total else 0.0
-    print(f"openjd_progress: {part:.1f}", file=sys.stderr, flush=True)
+def _openjd() -> Advance:
+    most = 0.0
+
+    def advance(done: int, total: int) -> None:
+        nonlocal most
+        # Open Job Description reads a task's progress from its output, in per cent. A take that has
+        # to be read again begins anew, and a task's progress never falls.
+        most = max(most, 100 * done / total if total else 0.0)
+        print(f"openjd_progress: {most:.1f}", file=sys.stderr, flush=True)
+
+    return advance

@@ -305,7 +305,10 @@ def _nothing_seen(take: "_Take") -> str:
     """Why there is no pixel that any frame shows."""
     finite = (np.isfinite(take.footage.read(f)).all(axis=-1).any() for f in take.used)
     if any(finite):
-        return f"{take.footage.sequence.pattern}: the holdout leaves nothing of any frame"
+        return (
+            f"{take.footage.sequence.pattern}: the holdout leaves nothing of any frame; give a"
+            " smaller one, or --holdout none"
+        )
     return (
         f"{take.footage.sequence.pattern}: every pixel of every frame is NaN or infinite;"
         " write the frames again"

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
 from shadowtool.core.noise import NoiseModel
+from shadowtool.core.regions import opened
 
 Float32 = NDArray[np.float32]
 Places = tuple[slice, ...] | tuple[NDArray[np.intp], ...]
@@ -52,8 +53,7 @@ def missing_shade(shadow_frames: NDArray[np.uint32]) -> Float32:
     Args:
         shadow_frames: (H, W), how many frames S rests on.
     """
-    specks = np.ones((_SPECKS, _SPECKS), np.uint8)
-    shaded = cv2.morphologyEx((shadow_frames > 0).view(np.uint8), cv2.MORPH_OPEN, specks)
+    shaded = opened(shadow_frames > 0, _SPECKS).view(np.uint8)
     away = cv2.distanceTransform(1 - shaded, cv2.DIST_L2, cv2.DIST_MASK_5)
     far = away > _FROM_SHADE * max(shaded.shape)
     return np.where(far, np.float32(_HARDLY), np.float32(np.inf))

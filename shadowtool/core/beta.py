@@ -15,6 +15,7 @@ from shadowtool.core.filling import fill_membrane
 from shadowtool.core.half_floats import to_float, to_half
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plates import Plates
+from shadowtool.core.regions import grown, large_parts
 
 Float16 = NDArray[np.float16]
 Float32 = NDArray[np.float32]
@@ -116,7 +117,7 @@ def shadow_contrast(plates: Plates, noise: NoiseModel) -> Float32:
     return contrast
 
 
-def unknown_beta(contrast: Float32, frames: NDArray[np.uint32] | None) -> Bool:
+def never_shaded(contrast: Float32, frames: NDArray[np.uint32] | None) -> Bool:
     """Where L and S do not differ by more than the noise, so that β can't be known.
 
     Args:
@@ -301,7 +302,7 @@ class Gauge:
             beta[rows.start - taken.start : rows.stop - taken.start, box.columns] = found
 
 
-def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> Float32:
+def fill_beta(beta: Float32, lit: Bool, hidden: Bool, fill: Fill) -> Float32:
     """Give unknown pixels a value.
 
     With ``lit`` they become 1. With ``inpaint`` small unknown patches and what the figure hides
@@ -312,7 +313,7 @@ def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> F
 
     Args:
         beta: (H, W) float32 in [0, 1] or NaN.
-        never_reached: (H, W), from `without_holes`.
+        lit: (H, W), where the shadow never reached, as of `never_reached`.
         hidden: (H, W), the figure is in front.
 
     Returns:
@@ -324,7 +325,7 @@ def fill_beta(beta: Float32, never_reached: Bool, hidden: Bool, fill: Fill) -> F
     if fill == "lit":
         np.copyto(filled, 1, where=np.isnan(filled))
         return filled
-    np.copyto(filled, 1, where=never_reached)
+    np.copyto(filled, 1, where=lit)
     # A pixel that was never shaded is no source to continue a shadow from only where it is itself
     # unknown; where it was set to 1 above it is as good as measured.
     np.copyto(filled, np.nan, where=hidden)
@@ -348,10 +349,10 @@ def _steepen(beta: Float32, hidden: Bool) -> None:
     for part in range(1, count):
         own = around(labels == part, _NEARBY)
         assert own is not None
-        inside = (labels[own] == part).view(np.uint8)
-        wide = 2 * float(cv2.distanceTransform(np.pad(inside, 1), cv2.DIST_L2, 3).max())
-        near = cv2.dilate(inside, np.ones((2 * _NEARBY + 1,) * 2, np.uint8)) > 0
-        beside = (cv2.dilate(inside, np.ones((2 * _RING + 1,) * 2, np.uint8)) > 0) & (inside == 0)
+        inside = labels[own] == part
+        depth = cv2.distanceTransform(np.pad(inside, 1).view(np.uint8), cv2.DIST_L2, 3)
+        wide = 2 * float(depth.max())
+        near, beside = grown(inside, _NEARBY), grown(inside, _RING) & ~inside
         around_it, steepest = whole[own][beside], slope[own][near]
         steepest = steepest[np.isfinite(steepest)]
         if not around_it.size or not steepest.size:
@@ -395,12 +396,7 @@ def _inpaint(image: Float32) -> None:
     image[box] = fill_membrane(values[..., np.newaxis], (~hole).astype(np.float32))[..., 0]
 
 
-def without_holes(never_shaded: Bool) -> Bool:
+def never_reached(never_shaded: Bool) -> Bool:
     """Of the pixels, (H, W), without a difference between L and S the large connected regions,
-    which the shadow never reached in the whole take."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(
-        never_shaded.astype(np.uint8), connectivity=8
-    )
-    large = stats[:, cv2.CC_STAT_AREA] > _LARGEST_HOLE * never_shaded.size
-    large[0] = False
-    return np.asarray(large[labels])
+    which the shadow never reached in the whole take; small ones are holes."""
+    return large_parts(never_shaded, _LARGEST_HOLE * never_shaded.size)

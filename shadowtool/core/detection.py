@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shadowtool.core.backdrop import Backdrop, Nearest, Places
 from shadowtool.core.bands import channel_sum
 from shadowtool.core.filling import fill_membrane
+from shadowtool.core.regions import grown, large_parts, opened, parts_with, shrunk, square
 from shadowtool.core.trimap import BACKGROUND, FIGURE
 
 Float32 = NDArray[np.float32]
@@ -107,26 +108,23 @@ def find_figure(
     near_line = _near_line(nearest, unknown)
     guide = (np.clip(image, 0, 1) ** np.float32(_GUIDE_POWER) * 255).astype(np.uint8)
 
-    square = np.ones((3, 3), np.uint8)
-
-    def within(distance2: Float32, near: float) -> UInt8:
+    def within(distance2: Float32, near: float) -> Bool:
         evidence = np.minimum(distance2 / 2 - near, nearest.from_lit2 / 2 - _NEAR_LIT)
         evidence = np.clip(evidence, -_MOST, _MOST)
         evidence[unknown] = 0
         evidence += other
         shared = cv2.ximgproc.fastGlobalSmootherFilter(guide, evidence, _SHARING, _LIKE)
-        return (shared > 0).astype(np.uint8)
+        return np.asarray(shared > 0)
 
     def mask_of(distance2: Float32) -> Bool:
         figure = within(distance2, _NEAR_LINE[1])
         if near_line < _NEAR_LINE[1]:
             # What is so near to the line is told by many pixels together alone.
-            more = within(distance2, near_line) & (1 - figure)
-            thick = cv2.morphologyEx(more, cv2.MORPH_OPEN, np.ones((reach + 1,) * 2, np.uint8))
-            figure |= _connected(more > 0, thick > 0).view(np.uint8)
-        edge = (cv2.dilate(figure, square) > 0) & (cv2.erode(figure, square) == 0)
-        figure[edge & (distance2 > _OFF_LINE2)] = 1
-        figure[(nearest.from_lit2 < _ON_LIT2) & (other < 0) & ~unknown] = 0
+            more = within(distance2, near_line) & ~figure
+            figure |= parts_with(more, opened(more, reach + 1))
+        edge = grown(figure, 1) & ~shrunk(figure, 1)
+        figure[edge & (distance2 > _OFF_LINE2)] = True
+        figure[(nearest.from_lit2 < _ON_LIT2) & (other < 0) & ~unknown] = False
         return _solid(figure, frame_size)
 
     mask = mask_of(nearest.distance2)
@@ -138,9 +136,9 @@ def find_figure(
     distance2[ring] = np.minimum(distance2[ring] + np.float32(_NO_SHADOW2), shadow2)
     mask = mask_of(distance2)
     # What is thinner than three pixels is no limb.
-    limbs = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    limbs = opened(mask, 3)
     strands = (distance2 > _OFF_LINE2) & (nearest.from_lit2 > _OFF_LINE2) & ~unknown
-    return Found(limbs, _connected(mask | strands, limbs), float(excess.max()))
+    return Found(limbs, parts_with(mask | strands, limbs), float(excess.max()))
 
 
 def _near_line(nearest: Nearest, unknown: Bool) -> float:
@@ -173,16 +171,13 @@ def _without_shadow(
 ) -> tuple[Places, Float32]:
     """Dark pixels in and around a figure that have no shadow near them, and their squared distance
     (N) in standard deviations from the background in the light that is seen around them."""
-    size = 2 * _RING * reach + 1
-    ring = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    ring = grown(mask, _RING * reach)
     seen = ~(ring | unknown)
     known = np.where(seen, nearest.beta, np.float32(0))[..., np.newaxis]
     beta = fill_membrane(known, seen.astype(np.float32))[..., 0]
     full = (nearest.beta < _FULL) & (nearest.distance2 < _OFF_LINE2) & ~mask & ~unknown
-    full = cv2.morphologyEx(full.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-    size = 2 * _NO_SHADOW * reach + 1
-    darkest = np.where(full, np.float32(0), beta)
-    darkest = cv2.erode(darkest, np.ones((size, size), np.uint8))
+    darkest = np.where(opened(full, 3), np.float32(0), beta)
+    darkest = cv2.erode(darkest, square(_NO_SHADOW * reach))
     places = np.nonzero(ring & (darkest > _LIT) & (nearest.beta < _DIMMED))
     here, value = backdrop.at(places), image[places]
     weight = 1 / here.variance(value)
@@ -237,11 +232,7 @@ def _leaning(hint: UInt8) -> Float32:
 def _background_error(nearest: Nearest, mask: Bool) -> Float32:
     """By how much more than noise the background is off its line, (H, W) ≥ 1: compression and
     coarse chroma, which do most harm around what moves, in shade and at its edge."""
-    figure = mask.astype(np.uint8)
-    away, beside = (
-        cv2.dilate(figure, np.ones((2 * radius + 1,) * 2, np.uint8)) == 0
-        for radius in (_AWAY, _BESIDE)
-    )
+    away, beside = (~grown(mask, radius) for radius in (_AWAY, _BESIDE))
     error = np.ones(mask.shape, np.float32)
     full, part = nearest.beta < 0.03, (nearest.beta >= 0.03) & (nearest.beta < 0.95)
     for shade, sample in ((full, away), (part, away), (~full & ~part, beside & ~away)):
@@ -252,21 +243,7 @@ def _background_error(nearest: Nearest, mask: Bool) -> Float32:
     return error
 
 
-def _solid(figure: UInt8, frame_size: int) -> Bool:
+def _solid(figure: Bool, frame_size: int) -> Bool:
     """Without specks, its small holes closed."""
-    for value, least, connectivity in ((1, _LEAST_FIGURE, 8), (0, _LEAST_HOLE, 4)):
-        part = (figure == value).astype(np.uint8)
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=connectivity)
-        small = stats[:, cv2.CC_STAT_AREA] < max(least * frame_size, _FEW)
-        small[0] = False
-        figure = np.where(small[labels], np.uint8(1 - value), figure)
-    return np.asarray(figure > 0)
-
-
-def _connected(mask: Bool, seeds: Bool) -> Bool:
-    """The connected parts of a mask that hold a seed."""
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    kept = np.zeros(int(labels.max()) + 1, bool)
-    kept[labels[seeds]] = True
-    kept[0] = False
-    return np.asarray(kept[labels])
+    figure = large_parts(figure, max(_LEAST_FIGURE * frame_size, _FEW))
+    return ~large_parts(~figure, max(_LEAST_HOLE * frame_size, _FEW), connectivity=4)

@@ -19,6 +19,7 @@ from shadowtool.core.color_line import Weighed, channels, line_distance
 from shadowtool.core.half_floats import to_float
 from shadowtool.core.medians import median
 from shadowtool.core.noise import NoiseModel
+from shadowtool.core.regions import large_parts
 from shadowtool.core.standing import Sampled
 
 Float32 = NDArray[np.float32]
@@ -90,8 +91,9 @@ _LEAST_SHADED = 3
 # Of textured ground a figure hides the texture: its logarithm over that of L scatters by more
 # than this within a few pixels.
 _TEXTURE = 0.12
-# A figure is at least this part of the picture.
-_LEAST_FIGURE = 1 / 4000
+# A figure is at least this part of the picture, and so many grid points; of nine that lie together
+# more than this part are its.
+_LEAST_FIGURE, _FEW, _SUPPORT = 1 / 4000, 6, 0.4
 
 
 def grid_step(width: int, height: int) -> int:
@@ -163,16 +165,13 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
 def figure_mask(image: Float32, background: Background) -> Bool:
     """Where a frame on the grid, (h, w, 3), shows something that is not the background."""
     lit, shadow, noise = background.lit, background.shadow, background.noise
-    off = (line_distance(image, lit, shadow, noise, _TOLERANCE) > _ON_LINE).astype(np.uint8)
+    off = line_distance(image, lit, shadow, noise, _TOLERANCE) > _ON_LINE
     # A lone grid point may be noise; a figure is connected, and its holes are its own.
     support = cv2.boxFilter(off.astype(np.float32), -1, (3, 3))
-    solid = ((off > 0) & (support > 0.4)).astype(np.uint8)
+    solid = (off & (support > _SUPPORT)).view(np.uint8)
     solid = cv2.morphologyEx(solid, cv2.MORPH_CLOSE, _disk(3)).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
-    large = stats[:, cv2.CC_STAT_AREA] >= max(_LEAST_FIGURE * solid.size, 6)
-    large[0] = False
-    solid = large[labels].astype(np.uint8) if count > 1 else np.zeros_like(solid)
-    return np.asarray(cv2.dilate(solid, _disk(2)) > 0)
+    large = large_parts(solid > 0, max(_LEAST_FIGURE * solid.size, _FEW))
+    return np.asarray(cv2.dilate(large.view(np.uint8), _disk(2)) > 0)
 
 
 def full_size(mask: Bool, width: int, height: int, step: int) -> UInt8:

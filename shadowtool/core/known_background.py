@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.bands import blocks
 from shadowtool.core.filling import fill_membrane
+from shadowtool.core.regions import square
 from shadowtool.core.transfer import LUMA
 from shadowtool.core.trimap import FIGURE, UNKNOWN, Prior
 
@@ -201,8 +202,7 @@ class _Around(NamedTuple):
 def _around(solid: Bool, behind: Float32, reach: int | None) -> _Around:
     darkest = None
     if reach is not None:
-        size = 2 * _UNSEEN_REACHES * reach + 1
-        darkest = np.asarray(cv2.erode(behind, np.ones((size, size), np.uint8)), np.float32)
+        darkest = np.asarray(cv2.erode(behind, square(_UNSEEN_REACHES * reach)), np.float32)
     return _Around(_nearest(solid), behind, _unevenness(behind), darkest)
 
 

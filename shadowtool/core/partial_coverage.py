@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from shadowtool.core.bands import blocks, channel_sum
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.noise import NoiseModel
+from shadowtool.core.regions import grown, large_parts, opened
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -41,6 +42,8 @@ _ALIKE, _SURFACE = 2.5, 4
 _COLOUR = 0.7
 # So many pixels at a time stay in the processor's cache.
 _BLOCK = 1 << 15
+# What is narrower than so many pixels is noise that looks like a shadow.
+_NOISE = 5
 # How far S/L of one plane's materials lies from their common one, as a part; at least.
 _LEAST_SPREAD = 0.03
 
@@ -59,7 +62,7 @@ def shadow_ratio_field(
         (H, W, 3) float32 and the spread of log ratios; None if nothing was shaded in full.
     """
     gray = _log_ratio(channel_sum(lit), channel_sum(shadow))
-    level = _opened(_level(gray, _usual(gray), frames))
+    level = opened(_level(gray, _usual(gray), frames), _NOISE)
     return _ratio_field(lit, shadow, gray, level, plane)
 
 
@@ -77,10 +80,10 @@ def _surfaces(gray: Float32, usual: Float32, frames: NDArray[np.uint32]) -> Iter
     """Where a shadow may have fallen in full, (H, W), what tells it best first."""
     # In a take of few frames no shadow stays for several.
     for least in (_FIRM, 1):
-        yield _opened(_level(gray, usual, frames, least))
+        yield opened(_level(gray, usual, frames, least), _NOISE)
     # A thin one is level nowhere.
     often = (frames >= _FIRM) & np.isfinite(gray)
-    yield _opened(often & ~_opened(often, 2 * _cell(gray.shape) + 1), 3)
+    yield opened(often & ~opened(often, 2 * _cell(gray.shape) + 1), 3)
 
 
 def _usual(gray: Float32) -> Float32:
@@ -200,8 +203,7 @@ def complete_shadow(
     result[few] = weight * result[few] + (1 - weight) * expected[few]
     if missed.any():
         # At the rim of what the card missed only its penumbra fell.
-        size = np.ones((4 * _cell(dark.shape) + 1,) * 2, np.uint8)
-        beside = cv2.dilate(missed.view(np.uint8), size) > 0
+        beside = grown(missed, 2 * _cell(dark.shape))
         own[beside & brighter & dark & ~surface] = 0
     nothing = (own == 0) & (dark | region | missed)
     cv2.copyTo(expected, nothing.view(np.uint8), result)
@@ -236,19 +238,9 @@ def _missed_by_the_card(lit: Float32, looked_at: Bool, dark: Bool, ratio: Float3
     return np.asarray((whole > 0) & never)
 
 
-def _opened(mask: Bool, width: int = 5) -> Bool:
-    """A mask without what is narrower than so many pixels: by default noise that looks like a
-    shadow."""
-    small = np.ones((width, width), np.uint8)
-    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, small) > 0)
-
-
 def _large(mask: Bool) -> Bool:
     """The connected parts of a mask that are as large as several coarse cells."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
-    large = stats[:, cv2.CC_STAT_AREA] >= (_SURFACE * _cell(mask.shape)) ** 2
-    large[0] = False
-    return np.asarray(large[labels])
+    return large_parts(mask, (_SURFACE * _cell(mask.shape)) ** 2, connectivity=4)
 
 
 def _log_ratio(lit: Float32, shadow: Float32) -> Float32:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.color_line import Weighed
+from shadowtool.core.regions import closed, grown, large_parts, parts, shrunk
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -179,7 +180,7 @@ class Sampled:
         if not his.any():
             # Of whoever passes no two points show much at a time.
             return
-        near = cv2.dilate(place.view(np.uint8), _square(_BESIDE)).ravel() > 0
+        near = grown(place, _BESIDE).ravel()
         near &= (found == self.lit).all(axis=0)
         near &= self.on_line[his].mean(axis=0) >= _STILL
         off = ~self.on_line & without[:, np.newaxis] & near
@@ -201,11 +202,8 @@ def _explained(samples: list[Weighed], lit: Float32, ratio: Float32 | np.float32
 
 def _places(mask: Bool) -> Iterator[Bool]:
     """The connected parts of a mask, (h, w), that are large enough; small gaps part nothing."""
-    closed = cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_CLOSE, _square(1))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
-    for label in range(1, count):
-        if stats[label, cv2.CC_STAT_AREA] >= max(_LEAST_PLACE * mask.size, _FEW):
-            yield np.asarray((labels == label) & mask)
+    for part in parts(large_parts(closed(mask, 1), max(_LEAST_PLACE * mask.size, _FEW))):
+        yield part & mask
 
 
 def _off_around(
@@ -213,9 +211,9 @@ def _off_around(
 ) -> list[float] | None:
     """By how much each of two things, (3, P), differs at a place's outline from what is around;
     None if nothing can be seen there."""
-    mask = cv2.morphologyEx(place.view(np.uint8), cv2.MORPH_CLOSE, _square(1))
-    inner = cv2.erode(mask, _square(_RIM), borderType=cv2.BORDER_REPLICATE) > 0
-    away = (free & (cv2.dilate(mask, _square(_GAP)) == 0)).astype(np.float32)
+    mask = closed(place, 1)
+    inner = shrunk(mask, _RIM)
+    away = (free & ~grown(mask, _GAP)).astype(np.float32)
     window = (2 * _AROUND + 1, 2 * _AROUND + 1)
 
     def total(values: Float32) -> Float32:
@@ -240,7 +238,3 @@ def _is_shade(dark: Float32, light: Float32) -> bool:
 
 def _logarithm(colours: Float32) -> Float32:
     return np.log(np.maximum(colours, np.float32(1e-4)))
-
-
-def _square(radius: int) -> NDArray[np.uint8]:
-    return np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)

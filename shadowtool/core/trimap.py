@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.regions import shrunk, square
+
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
@@ -59,8 +61,7 @@ def wide_trimap(mask: Bool, maybe: Bool, reach: int) -> UInt8:
         (H, W) uint8: 0 background, 128 unknown, 255 figure.
     """
     inside, outside = _distances(mask)
-    size = 2 * reach + 1
-    thickness = cv2.dilate(inside, np.ones((size, size), np.uint8))
+    thickness = cv2.dilate(inside, square(reach))
     depth = np.minimum(reach + 0.5, np.maximum(_CORE * thickness + 0.5, _LEAST_CORE))
     core = mask & (inside >= depth)
     if not core.any():
@@ -129,7 +130,7 @@ def doubted(prior: Prior, distance2: Float32) -> Prior:
 
 def narrowed(trimap: UInt8, prior: Prior, mask: Bool) -> UInt8:
     """A trimap whose unknown band is as wide as its edge; the mask's rim stays in it."""
-    inside = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    inside = shrunk(mask, 1)
     narrow = trimap.copy()
     narrow[(trimap == UNKNOWN) & inside & (prior.mean >= _SOLID)] = FIGURE
     return narrow

@@ -231,7 +231,7 @@ class _Scene:
         contrast = shadow_beta.shadow_contrast(plates, noise)
         # Means have no range of extremes to allow for.
         frames = plates.frames if plates.shadow_frames is None else None
-        never_shaded = shadow_beta.unknown_beta(contrast, frames)
+        never_shaded = shadow_beta.never_shaded(contrast, frames)
         confidence = shadow_beta.confidence(contrast)
         contrasts = [contrast]
         if beta == "rgb":
@@ -249,8 +249,8 @@ class _Scene:
             doubt = np.where(plates.shadow_frames == 0, np.float32(_GUESSED), np.float32(0))
             missing = missing_shade(plates.shadow_frames)
         backdrop = Backdrop(lit, shadow, noise, doubt, missing)
-        reached = shadow_beta.without_holes(never_shaded)
-        return cls(backdrop, unknown, reached, gauge, confidence, step, on_grid(lit, step))
+        lit_always = shadow_beta.never_reached(never_shaded)
+        return cls(backdrop, unknown, lit_always, gauge, confidence, step, on_grid(lit, step))
 
 
 class _Shown(NamedTuple):
@@ -468,9 +468,9 @@ class _Take:
 
     def _filled(self, beta: Float32, hidden: Bool) -> Float16:
         filled = np.empty(beta.shape, np.float16)
-        reached = self.scene.never_reached
+        lit = self.scene.never_reached
         for plane, out in zip(_planes(beta), _planes(filled), strict=True):
-            out[:] = to_half(shadow_beta.fill_beta(plane, reached, hidden, self.fill))
+            out[:] = to_half(shadow_beta.fill_beta(plane, lit, hidden, self.fill))
         return filled
 
 

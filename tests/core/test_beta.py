@@ -8,10 +8,10 @@ from shadowtool.core.beta import (
     fill_beta,
     inpaint,
     inverse_span,
+    never_reached,
+    never_shaded,
     shadow_contrast,
     shadow_matte,
-    unknown_beta,
-    without_holes,
 )
 from shadowtool.core.compositing import shade
 from shadowtool.core.noise import NoiseModel
@@ -82,14 +82,14 @@ def test_extremes_of_noise_alone_are_unknown() -> None:
     shots = clean + rng.normal(size=(60, *clean.shape)) * NOISE.sigma(clean)
     plates = Plates(shots.max(axis=0).astype(np.float32), shots.min(axis=0).astype(np.float32))
     frames = np.full(clean.shape[:2], 60, np.uint32)
-    assert unknown_beta(shadow_contrast(plates, NOISE), frames).mean() > 0.999
+    assert never_shaded(shadow_contrast(plates, NOISE), frames).mean() > 0.999
     scene = Scene()
     real = Plates(scene.lit, scene.shadow)
-    assert not unknown_beta(shadow_contrast(real, NOISE), frames).any()
+    assert not never_shaded(shadow_contrast(real, NOISE), frames).any()
 
 
 def test_nan_contrast_is_unknown() -> None:
-    assert unknown_beta(np.float32([[np.nan, 100]]), None).tolist() == [[True, False]]
+    assert never_shaded(np.float32([[np.nan, 100]]), None).tolist() == [[True, False]]
 
 
 def holes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -117,7 +117,7 @@ def test_filling_none_keeps_what_is_unknown() -> None:
 
 def test_inpainting_continues_holes_and_lights_what_no_shadow_reached() -> None:
     beta, never, hidden = holes()
-    filled = fill_beta(beta, without_holes(never), hidden, "inpaint")
+    filled = fill_beta(beta, never_reached(never), hidden, "inpaint")
     assert filled[31, 31] == pytest.approx(0.25, abs=0.02)
     assert filled[40:43, 44:46] == pytest.approx(0.25, abs=0.02)
     assert (filled[:, 70:] == 1).all()

@@ -203,8 +203,8 @@ CONTRACTS = {
         lambda h, w: st.tuples(picture(h, w, TAME), picture(h, w, TAME)),
         lambda r, lit, s: is_single(r, *lit.shape) and (r >= 0).all(),
     ),
-    "unknown_beta": Contract(
-        beta.unknown_beta,
+    "never_shaded": Contract(
+        beta.never_shaded,
         lambda h, w: st.tuples(
             plane(h, w), array(h, w, elements=st.integers(0, 2000), dtype=np.uint32)
         ),

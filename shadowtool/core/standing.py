@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.color_line import Weighed
 from shadowtool.core.regions import closed, grown, large_parts, parts, shrunk
+from shadowtool.core.samples import mean_where
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -125,9 +126,8 @@ class Sampled:
         whole_lit[:, points], whole_seen[:, points] = lit, seen
         often = np.zeros(self.on_line.shape[1], bool)
         often[points] = most >= least
-        total = np.einsum("tcn,tn->cn", self.stack, whole_lit.astype(np.float32))
-        colour = total / np.maximum(whole_lit.sum(axis=0), 1)
-        return _Other(np.asarray(colour, np.float32), whole_seen, often)
+        colour, _ = mean_where(self.stack, whole_lit)
+        return _Other(colour, whole_seen, often)
 
     def _uncover(
         self, found: Float32, other: _Other, place: Bool, free: Bool

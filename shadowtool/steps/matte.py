@@ -25,8 +25,8 @@ from shadowtool.core.exposure import (
     unevenness,
     without_gain,
 )
+from shadowtool.core.grid import exposure_rows, exposure_step, on_grid
 from shadowtool.core.half_floats import not_finite, to_float
-from shadowtool.core.holdout import exposure_rows, exposure_step, on_grid
 from shadowtool.core.matting import (
     HIDDEN,
     MARGIN,

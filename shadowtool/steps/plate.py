@@ -26,16 +26,12 @@ from shadowtool.core.exposure import (
     unevenness,
     without_gain,
 )
+from shadowtool.core.grid import exposure_rows, exposure_step, full_size, grid_step, on_grid
 from shadowtool.core.half_floats import not_finite, shortened
 from shadowtool.core.holdout import (
     Background,
-    exposure_rows,
-    exposure_step,
     figure_mask,
     find_background,
-    full_size,
-    grid_step,
-    on_grid,
 )
 from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
 from shadowtool.core.partial_coverage import complete_shadow

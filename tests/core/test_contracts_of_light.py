@@ -15,8 +15,8 @@ from shadowtool.core import (
     noise,
     trembling,
 )
+from shadowtool.core.grid import grid_step
 from shadowtool.core.half_floats import all_finite, to_float, to_half
-from shadowtool.core.holdout import grid_step
 from shadowtool.core.plates import ExtremePlates, Plates
 from shadowtool.core.resizing import resized
 from shadowtool.core.transfer import TRANSFERS

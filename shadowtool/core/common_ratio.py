@@ -110,8 +110,9 @@ class _Frequent(NamedTuple):
 
 def common_ratio(
     stack: Float32, ascending: Index, noise: NoiseModel, size: tuple[int, int]
-) -> Float32:
-    """S/L of each point, (3, N), as the scene's shadows have it in common around.
+) -> Float32 | None:
+    """S/L of each point, (3, N), as the scene's shadows have it in common around; None if none is
+    much more frequent than others.
 
     Of a shadow that is all but black noise leaves no ratio, but then more samples are black than
     have any one. Where a lamp is near, its shadow is deeper than elsewhere: a window of the grid
@@ -135,9 +136,7 @@ def common_ratio(
         _, ratios = _ratios(stack, bright, black)
         ratio = np.clip(median(ratios), 0, _LIGHTEST_RATIO)
         return np.repeat(ratio[:, np.newaxis], light.size, axis=1)
-    if common is None:
-        return np.full(bright.shape, 0.25, np.float32)
-    return _with_windows(compared, common.ratio, noise)
+    return None if common is None else _with_windows(compared, common.ratio, noise)
 
 
 def _with_windows(compared: _Compared, common: Float32, noise: NoiseModel) -> Float32:

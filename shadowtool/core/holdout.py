@@ -38,6 +38,8 @@ _SHADED, _MOST, _AT_ONCE = 0.5, 0.5, 0.2
 # more than a factor.
 _LARGE, _SOMEBODY = 0.09, 0.6
 _BRIGHTER, _COUNTED, _DIFFERS = 0.1, 7.0, 1.35
+# Where shadows have no ratio in common.
+_ANY_RATIO = 0.25
 # From the first to the second β a sample is neither in light nor in shade, and counts so much.
 _SHADE_ENDS, _LIGHT_BEGINS, _BETWEEN = 0.15, 0.85, 0.75
 # Candidates for L are every so many of a pixel's samples, dark to bright.
@@ -66,12 +68,15 @@ class Background:
         under_card: whether a shadow came over most of the picture: that is a card waved over a
             scene whose surfaces have each their own S/L, for which these lines don't stand, and
             nobody is in it.
+        ratio: (3,), the median of S/L that the scene's shadows have in common; None if they have
+            none.
     """
 
     lit: Float32
     shadow: Float32
     noise: NoiseModel
     under_card: bool
+    ratio: Float32 | None
 
 
 def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
@@ -85,7 +90,8 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     stack = np.nan_to_num(stack, copy=False, nan=0.0, posinf=1e4, neginf=0.0)
     weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
     ascending = np.argsort(stack.sum(axis=1), axis=0)
-    ratio = common_ratio(stack, ascending, noise, shape[:2])
+    common = common_ratio(stack, ascending, noise, shape[:2])
+    ratio = np.full(stack.shape[1:], _ANY_RATIO, np.float32) if common is None else common
     lit = np.empty_like(ratio)
     for part in blocks(lit.shape[1], _BLOCK):
         samples_part = [sample.part(part) for sample in weighed]
@@ -97,7 +103,8 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     under_card = _under_a_card(stack, on_line, lit)
     shadow = _deeper_shade(stack, on_line, lit, shadow, shape[:2])
     lit, shadow = (np.ascontiguousarray(plate.T).reshape(shape) for plate in (lit, shadow))
-    return Background(lit, shadow, noise, under_card)
+    told = None if common is None else np.median(common, axis=1)
+    return Background(lit, shadow, noise, under_card, told)
 
 
 def figure_mask(image: Float32, background: Background) -> Bool:

@@ -44,46 +44,28 @@ _COLOUR = 0.7
 _BLOCK = 1 << 15
 # What is narrower than so many pixels is noise that looks like a shadow.
 _NOISE = 5
+# What is dimmed by less than this part of what shadows have in common, a logarithm, or by less than
+# the second where they are deep, is none: whoever stands near takes some of the sky.
+_HARDLY, _HARDLY_DEEP = 1 / 3, 0.4
 # How far S/L of one plane's materials lies from their common one, as a part; at least.
 _LEAST_SPREAD = 0.03
 
 
-def shadow_ratio_field(
-    lit: Float32, shadow: Float32, frames: NDArray[np.uint32], plane: Bool | None
-) -> tuple[Float32, float] | None:
-    """The smoothly varying S/L of the scene's main plane, and how far materials scatter about it.
-
-    Args:
-        lit, shadow: (H, W, 3), NaN unknown.
-        frames: (H, W), how many frames the shadow rests on.
-        plane: (H, W), where to look; None for everywhere.
-
-    Returns:
-        (H, W, 3) float32 and the spread of log ratios; None if nothing was shaded in full.
-    """
-    gray = _log_ratio(channel_sum(lit), channel_sum(shadow))
-    level = opened(_level(gray, _usual(gray), frames), _NOISE)
-    return _ratio_field(lit, shadow, gray, level, plane)
-
-
-def _level(gray: Float32, usual: Float32, frames: NDArray[np.uint32], least: int = _FIRM) -> Bool:
-    """Where a shadow fell in so many frames and log(S/L) is level: what climbs is a penumbra,
-    however long it stood there.
+def _surfaces(usual: Float32, frames: NDArray[np.uint32], dimmed: Bool) -> Iterator[Bool]:
+    """Where a shadow may have fallen in full, (H, W), what tells it best first.
 
     Args:
         usual: of `_usual`.
+        dimmed: (H, W), where anything that is a shadow fell.
     """
-    return (frames >= least) & np.isfinite(gray) & (_slope(usual) < _SLOPE)
-
-
-def _surfaces(gray: Float32, usual: Float32, frames: NDArray[np.uint32]) -> Iterator[Bool]:
-    """Where a shadow may have fallen in full, (H, W), what tells it best first."""
+    # What climbs is a penumbra, however long it stood there.
+    level = dimmed & (_slope(usual) < _SLOPE)
     # In a take of few frames no shadow stays for several.
     for least in (_FIRM, 1):
-        yield opened(_level(gray, usual, frames, least), _NOISE)
+        yield opened(level & (frames >= least), _NOISE)
     # A thin one is level nowhere.
-    often = (frames >= _FIRM) & np.isfinite(gray)
-    yield opened(often & ~opened(often, 2 * _cell(gray.shape) + 1), 3)
+    often = dimmed & (frames >= _FIRM)
+    yield opened(often & ~opened(often, 2 * _cell(usual.shape) + 1), 3)
 
 
 def _usual(gray: Float32) -> Float32:
@@ -136,6 +118,7 @@ def complete_shadow(
     noise: NoiseModel,
     plane: Bool | None = None,
     card: bool | None = None,
+    ratio: Float32 | None = None,
 ) -> Completed:
     """The shadow plate with S/L of the plane where the shadow itself says too little.
 
@@ -153,6 +136,9 @@ def complete_shadow(
         plane: (H, W) the region of the plane, if it is known: the second reading holds there, the
             first elsewhere, but that what was never darkened is left as it is.
         card: which of the two holds for all of it otherwise; None if nobody knows.
+        ratio: (3,), what S/L the take's shadows have in common, if that is known of a scene that a
+            shadow crossed. What is dimmed by much less is no shadow, and where none fell in full it
+            is the plane's.
     """
     seen, dark = np.isfinite(channel_sum(lit)), np.isfinite(channel_sum(shadow))
     if plane is None:
@@ -167,10 +153,13 @@ def complete_shadow(
     usual = _usual(gray)
     with np.errstate(invalid="ignore"):
         alone = np.abs(gray - usual) > _COMMON
-    for surface in _surfaces(gray, usual, frames):
+    dimmed = gray < -_least_dimmed(ratio)
+    for surface in _surfaces(usual, frames, dimmed):
         if (found := _ratio_field(lit, shadow, gray, surface, plane)) is not None:
             break
     result = np.asarray(cv2.copyTo(shadow, dark.view(np.uint8), lit.copy()), np.float32)
+    if found is None and partial and ratio is not None:
+        found = np.ones_like(lit) * ratio, _LEAST_SPREAD
     if found is None:
         return Completed(result, np.asarray(dark, np.float32), plane is not None)
     expected, spread = found
@@ -190,6 +179,7 @@ def complete_shadow(
     # On the plane only what is level over some area can be a surface of its own: in a take of few
     # frames a partial shadow is level here and there.
     own[region & ~(darker | alike | (_large(surface & above) & ~alone))] = 0
+    own[region & ~dimmed] = 0
     # Few frames say less of the shadow than the plane's ratio does, where the two may be the same.
     both = np.flatnonzero(alike & region & (own > 0))
     for part in blocks(both.size, _BLOCK):
@@ -208,6 +198,14 @@ def complete_shadow(
     nothing = (own == 0) & (dark | region | missed)
     cv2.copyTo(expected, nothing.view(np.uint8), result)
     return Completed(result, own, partial)
+
+
+def _least_dimmed(ratio: Float32 | None) -> float:
+    """By how much light is dimmed at least where a shadow falls, a logarithm."""
+    if ratio is None:
+        return -np.inf
+    deep = -float(np.log(np.maximum(ratio, np.float32(1e-5))).mean())
+    return min(_HARDLY * deep, _HARDLY_DEEP)
 
 
 def _missed_by_the_card(lit: Float32, looked_at: Bool, dark: Bool, ratio: Float32) -> Bool:

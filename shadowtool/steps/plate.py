@@ -288,6 +288,12 @@ def _advise(figures: Figures, take: "_Take", estimator: Estimator) -> None:
     say_flickers(take.footage, take.bands)
     if figures.get("shaded") == 0:
         logger.warning("%s: no shadow moves over the scene", name)
+    elif figures.get("own_evidence") == 0:
+        logger.warning(
+            "%s: no shadow fell anywhere in full; how dark it would be is guessed from single"
+            " frames, look at shadow.exr",
+            name,
+        )
     elif figures.get("read_as") == UNDER_A_CARD and figures["shaded"] < _WELL_SHADED:
         logger.warning(
             "%s: %.0f%% of the picture never got darker; what is as bright as lit ground counts as"
@@ -630,9 +636,11 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
     del estimate
     lit = shortened(found.lit)
 
+    ratio = None if take.background is None else take.background.ratio
+
     def complete() -> tuple[Plates, Figures]:
         completed = complete_shadow(
-            lit, found.shadow, found.shadow_frames, noise, region, take.card
+            lit, found.shadow, found.shadow_frames, noise, region, take.card, ratio
         )
         shadow = shortened(completed.shadow)
         plates = Plates(lit, shadow, found.lit_frames, found.shadow_frames)

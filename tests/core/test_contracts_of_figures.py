@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from shadowtool.core import holdout, matting, partial_coverage
+from shadowtool.core import grid, matting, partial_coverage
 from shadowtool.core.backdrop import Backdrop
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.robust_plates import hide, keyed
@@ -83,14 +83,14 @@ CONTRACTS = {
         lambda r, c, lit, shadow, a: is_figure(r, c),
     ),
     "on_grid": Contract(
-        lambda a: holdout.on_grid(a, 2),
+        lambda a: grid.on_grid(a, 2),
         lambda h, w: st.tuples(halfs(h, w)),
         lambda r, a: r.dtype == np.float32 and np.array_equal(
             r, a[::2, ::2].astype(np.float32), equal_nan=True
         ),
     ),
     "full_size": Contract(
-        lambda m: holdout.full_size(m, 2 * m.shape[1], 2 * m.shape[0], 2),
+        lambda m: grid.full_size(m, 2 * m.shape[1], 2 * m.shape[0], 2),
         lambda h, w: st.tuples(mask(h, w)),
         lambda r, m: (
             r.shape == (2 * m.shape[0], 2 * m.shape[1])

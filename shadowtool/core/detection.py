@@ -56,6 +56,10 @@ _RING, _NO_SHADOW, _LIT, _FULL = 2, 5, 0.8, 0.15
 # second, or a shadow, which costs as much as the third, a squared distance. Above it there is what
 # a figure takes of the sky.
 _DIMMED, _LIGHT, _NO_SHADOW2 = 0.6, 0.1, 8.0
+# So many pixels far colour leaks over an edge of shade, up to this part of what changes there. Of a
+# part of the figure at least the next part is so whatever leaks, or other evidence is so much, a
+# logarithm, in the mean.
+_LEAKS, _LEAKING, _CERTAIN, _TOLD = 2, 0.1, 0.2, 1.5
 # What is so many pixels from the figure has nothing of it; beside it begins sooner.
 _AWAY, _BESIDE = 5, 1
 # A figure is at least this part of the picture, a hole in it at least that; neither is but a few
@@ -137,8 +141,39 @@ def find_figure(
     mask = mask_of(distance2)
     # What is thinner than three pixels is no limb.
     limbs = opened(mask, 3)
+    limbs = _certain_parts(limbs, _with_leaks(image, backdrop, nearest) / excess**2, other)
     strands = (distance2 > _OFF_LINE2) & (nearest.from_lit2 > _OFF_LINE2) & ~unknown
     return Found(limbs, parts_with(mask | strands, limbs), float(excess.max()))
+
+
+def _with_leaks(image: Float32, backdrop: Backdrop, nearest: Nearest) -> Float32:
+    """Squared distances from the line where, beside the noise, colour leaks over edges of shade, as
+    a mosaic or coarse chroma makes it do."""
+    ground, beta = nearest.distance2 < _OFF_LINE2, np.clip(nearest.beta, 0, 1)
+    most = cv2.dilate(np.where(ground, beta, np.float32(0)), square(_LEAKS))
+    least = cv2.erode(np.where(ground, beta, np.float32(1)), square(_LEAKS))
+    step = np.float32(_LEAKING) * np.maximum(most - least, 0)
+    leak = step[..., np.newaxis] * (backdrop.lit - backdrop.shadow)
+    more = channel_sum(leak * leak / backdrop.variance(image)) / 3
+    return np.asarray(nearest.distance2 / (1 + more), np.float32)
+
+
+def _certain_parts(mask: Bool, distance2: Float32, other: Float32) -> Bool:
+    """The connected parts of a mask of which enough is off the line even where colour leaks, or
+    that other evidence tells: the rest are strips of an edge of shade.
+
+    Args:
+        distance2: as of `_with_leaks`.
+        other: (H, W), evidence besides the distance.
+    """
+    count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
+    size, sure, told = (
+        np.bincount(labels.ravel(), values.ravel(), count)
+        for values in (mask, distance2 > _OFF_LINE2, other)
+    )
+    kept = (sure >= _CERTAIN * size) | (told > _TOLD * size)
+    kept[0] = False
+    return np.asarray(kept[labels])
 
 
 def _near_line(nearest: Nearest, unknown: Bool) -> float:

@@ -87,6 +87,28 @@ def test_many_pixels_together_tell_clothes_from_shade_of_nearly_their_colour() -
     assert mask[40:80, 95:120].mean() < 0.01
 
 
+def leaking() -> np.ndarray:
+    """A large soft shadow, and a long one over whose sharp edges colour leaks for a few pixels."""
+    beta = SCENE.disk(110, 70, radius=22, soft=16).astype(np.float32)
+    beta[12:21, 20:140] = 0
+    coarse = beta + np.float32(0.15) * (cv2.GaussianBlur(beta, (0, 0), 2) - beta)
+    beta = np.dstack([coarse, beta, coarse])
+    return SCENE.noisy((beta * EVEN.lit + (1 - beta) * EVEN.shadow).astype(np.float32), 2)
+
+
+def test_edges_of_shade_over_which_colour_leaks_are_no_figure() -> None:
+    assert not found_in(leaking(), EVEN).mask.any()
+
+
+@pytest.mark.parametrize("y", [30, 40])
+def test_something_small_beside_such_shade_is_figure(y: int) -> None:
+    image, ball = leaking(), disk(70, y, 5) == 1
+    image[ball] = SCENE.noisy(np.full_like(image, 0.3) * np.float32([0.2, 0.5, 1.5]), 5)[ball]
+    mask = found_in(image, EVEN).mask
+    assert mask[ball].mean() > 0.95
+    assert not mask[disk(70, y, 12) == 0].any()
+
+
 def test_a_few_pixels_do_not() -> None:
     image = near_the_line(SLIVER)
     image[40:80, 95:120] = SCENE.noisy(EVEN.shadow, 4)[40:80, 95:120]

@@ -44,6 +44,8 @@ _TEXTURE_RANKS, _AROUND, _LEAST_LIKELY = (0.8, 0.95), 0.3, 0.05
 # Samples of one colour are within so many deviations of it; it is found in so many rounds. No ratio
 # of shadow is above the last.
 _CLUSTER, _ROUNDS, _LIGHTEST_RATIO = 2.5, 3, 0.9
+# How ratios scatter every so many samples tell; in colour by no more than noise and this.
+_SOME_SAMPLES, _ROUGH_COLOUR = 3, 0.05
 # So many windows down and across, of so many points down and across at least, may have ratios of
 # their own, if they have more than the first part of the ground's texture for certain, and differ
 # by no more than the second, a logarithm, in one look, and in no channel from the others by more
@@ -137,6 +139,39 @@ def common_ratio(
         ratio = np.clip(median(ratios), 0, _LIGHTEST_RATIO)
         return np.repeat(ratio[:, np.newaxis], light.size, axis=1)
     return None if common is None else _with_windows(compared, common.ratio, noise)
+
+
+def ratio_scatter(
+    stack: Float32, ascending: Index, noise: NoiseModel, ratio: Float32, size: tuple[int, int]
+) -> float:
+    """How far S/L differs from point to point, a standard deviation of its logarithm besides the
+    noise; 0 where too few samples tell.
+
+    Ground that is rough has grains that face the sky and others that don't, and a mosaic makes more
+    of that. Points in shade that are next to each other tell, wherever the ratio in common varies
+    across the picture.
+
+    Args:
+        stack, ascending, noise, size: as of `common_ratio`.
+        ratio: (3, N), what that found.
+    """
+    bright = _usually_bright(stack, stack.sum(axis=1), ascending)
+    shade = np.maximum(bright * ratio, np.float32(1e-4))
+    noisy = np.hypot(noise.sigma(shade.T).T / shade, noise.sigma(bright.T).T / bright.clip(1e-4))
+    off = np.log(np.maximum(stack[::_SOME_SAMPLES], np.float32(1e-4)) / shade)
+    level = off.mean(axis=1)
+    in_shade = (np.abs(off - level[:, np.newaxis]) < _CLUSTER * np.hypot(noisy, _ROUGH_COLOUR)).all(
+        axis=1
+    )
+    in_shade &= np.abs(level) < np.abs(np.log(np.maximum(ratio, np.float32(1e-4)))).mean(axis=0) / 2
+    in_shade &= bright.sum(axis=0) > _CLEAR * noise.sigma(bright.T).sum(axis=1)
+    level, in_shade = (values.reshape(-1, *size) for values in (level, in_shade))
+    steps = np.diff(level, axis=2)[in_shade[..., 1:] & in_shade[..., :-1]]
+    if steps.size < _TELLING:
+        return 0.0
+    scatter = float(median(np.abs(steps))) / (0.6745 * np.sqrt(2))
+    of_mean = float(np.median(noisy)) / np.sqrt(3)
+    return float(np.sqrt(max(scatter**2 - of_mean**2, 0)))
 
 
 def _with_windows(compared: _Compared, common: Float32, noise: NoiseModel) -> Float32:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import blocks
 from shadowtool.core.color_line import Weighed, channels, line_distance
-from shadowtool.core.common_ratio import common_ratio
+from shadowtool.core.common_ratio import common_ratio, ratio_scatter
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.regions import large_parts
 from shadowtool.core.samples import mean_where, ranked
@@ -38,6 +38,10 @@ _SHADED, _MOST, _AT_ONCE = 0.5, 0.5, 0.2
 # more than a factor.
 _LARGE, _SOMEBODY = 0.09, 0.6
 _BRIGHTER, _COUNTED, _DIFFERS = 0.1, 7.0, 1.35
+# Where S/L scatters from point to point a sample may be off by this part of that too, up to the
+# second; and where it does by more than the third, a logarithm, so many times of it make S darker:
+# most of the ground is on the line then.
+_ROUGHNESS, _ROUGHEST, _EVEN, _DARKER = 0.5, 0.05, 0.1, 2.0
 # Where shadows have no ratio in common.
 _ANY_RATIO = 0.25
 # From the first to the second β a sample is neither in light nor in shade, and counts so much.
@@ -68,6 +72,7 @@ class Background:
         under_card: whether a shadow came over most of the picture: that is a card waved over a
             scene whose surfaces have each their own S/L, for which these lines don't stand, and
             nobody is in it.
+        tolerance: by what part of its value a sample may be off its line besides the noise.
         ratio: (3,), the median of S/L that the scene's shadows have in common; None if they have
             none.
     """
@@ -76,6 +81,7 @@ class Background:
     shadow: Float32
     noise: NoiseModel
     under_card: bool
+    tolerance: float
     ratio: Float32 | None
 
 
@@ -102,15 +108,19 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     shadow = lit * ratio
     under_card = _under_a_card(stack, on_line, lit)
     shadow = _deeper_shade(stack, on_line, lit, shadow, shape[:2])
+    scatter = 0.0 if common is None else ratio_scatter(stack, ascending, noise, ratio, shape[:2])
+    if scatter > _EVEN:
+        shadow *= np.float32(math.exp(-_DARKER * scatter))
+    tolerance = _TOLERANCE + min(_ROUGHNESS * scatter, _ROUGHEST)
     lit, shadow = (np.ascontiguousarray(plate.T).reshape(shape) for plate in (lit, shadow))
     told = None if common is None else np.median(common, axis=1)
-    return Background(lit, shadow, noise, under_card, told)
+    return Background(lit, shadow, noise, under_card, tolerance, told)
 
 
 def figure_mask(image: Float32, background: Background) -> Bool:
     """Where a frame on the grid, (h, w, 3), shows something that is not the background."""
-    lit, shadow, noise = background.lit, background.shadow, background.noise
-    off = line_distance(image, lit, shadow, noise, _TOLERANCE) > _ON_LINE
+    line = background.lit, background.shadow, background.noise, background.tolerance
+    off = line_distance(image, *line) > _ON_LINE
     # A lone grid point may be noise; a figure is connected, and its holes are its own.
     support = cv2.boxFilter(off.astype(np.float32), -1, (3, 3))
     solid = (off & (support > _SUPPORT)).view(np.uint8)

@@ -475,3 +475,20 @@ def test_a_lone_pixel_is_no_figure() -> None:
     frame = SCENE.noisy(SCENE.lit, 99)
     frame[60, 100] = 3
     assert not figure_mask(frame, background).any()
+
+
+def test_shade_of_rough_ground_is_background() -> None:
+    """Of gravel each grain has a ratio of its own."""
+    rng = np.random.default_rng(8)
+    rough = np.exp(0.15 * rng.standard_normal((HEIGHT, WIDTH, 1)))
+    frames, betas = [], []
+    for number in range(FRAMES):
+        beta = shadow_beta(25 + 4.8 * number)
+        shade = SCENE.lit * RATIO * rough
+        image = beta[..., None] * SCENE.lit + (1 - beta[..., None]) * shade
+        frames.append(SCENE.noisy(image.astype(np.float32), number))
+        betas.append(beta)
+    places = np.linspace(0, FRAMES - 1, SAMPLES).round().astype(int)
+    background = find_background([frames[i] for i in places], NOISE)
+    held = [figure_mask(f, background)[b < 0.1] for f, b in zip(frames, betas, strict=True)]
+    assert np.concatenate(held).mean() < 0.05

@@ -40,6 +40,8 @@ _MOST, _NEARLY_ALL = 0.6, 0.85
 _ALIKE, _SURFACE = 2.5, 4
 # Of ground in light colours differ by less than this, the range of a log over the channels.
 _COLOUR = 0.7
+# Most of the ground is as bright as half of it is, to this logarithm.
+_GROUND = 0.5
 # So many pixels at a time stay in the processor's cache.
 _BLOCK = 1 << 15
 # What is narrower than so many pixels is noise that looks like a shadow.
@@ -216,6 +218,11 @@ def _missed_by_the_card(lit: Float32, looked_at: Bool, dark: Bool, ratio: Float3
     if not never.any() or where.size < 50:
         return np.zeros_like(never)
     light = np.log(np.maximum(lit.reshape(-1, 3).take(where, axis=0), np.float32(1e-5)))
+    brightness = light.mean(axis=1)
+    ground = np.abs(brightness - np.median(brightness)) < _GROUND
+    if ground.mean() > 0.5:
+        # Beside something black, shade would pass for ground in light.
+        where, light = where[ground], light[ground]
     # Areas are told by some of their pixels.
     every = (slice(None, None, _step(dark.shape)),) * 2
     around = _stretched(_smooth(light, where, dark.shape), dark.shape)[every].copy()

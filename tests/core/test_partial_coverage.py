@@ -231,6 +231,15 @@ def test_light_that_the_card_missed_is_told_from_shade_and_from_the_sky() -> Non
         assert np.array_equal(shadow[alone], take.lit[alone])
 
 
+def test_shade_beside_something_black_is_not_taken_for_light_that_the_card_missed() -> None:
+    shade, black = (np.abs(COLUMNS - 60) < 12) & (ROWS > 20), np.abs(COLUMNS - 84) < 12
+    take = crossed(surfaces(), shade.astype(float))
+    take.lit[shade] *= np.float32(0.2)
+    take.lit[black] *= np.float32(0.02)
+    take.measured[black] *= np.float32(0.02)
+    assert np.array_equal(take.completed().shadow[shade], take.lit[shade])
+
+
 def test_a_region_confines_what_the_plane_says() -> None:
     take = crossed(RATIO, band())
     plane = COLUMNS < 80

@@ -1,3 +1,3 @@
 """Shadow matting and compositing after Chuang et al., SIGGRAPH 2003."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

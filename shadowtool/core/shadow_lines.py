@@ -7,7 +7,7 @@ interpolated; the paper's x = m·y + b fails for lines near horizontal.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -36,6 +36,8 @@ _LONGEST_RUN = 4
 # A direction jumps if it is this many times the pass's median deviation off its neighbours'
 # course, and by more than the floor, radians.
 _JUMP_RATIO, _JUMP_FLOOR = 5.0, np.radians(0.75)
+# Lines that lie no further apart than this, pixels, stand still.
+_STILL = 0.5
 # About so many pixels tell how far they are off their lines.
 _SOME_PLACES = 50_000
 # Bends are looked for in about so many lines, and told from so many.
@@ -346,6 +348,7 @@ class _Line:
     offset: float
     residual: float
     points: int
+    middle: Float64
 
 
 def _fit(points: Float64) -> _Line | None:
@@ -378,7 +381,8 @@ def _fit(points: Float64) -> _Line | None:
     if values[1] < _LEAST_SPREAD**2:
         return None
     normal = vectors[:, 0]
-    return _Line(normal, float(-normal @ middle), float(np.sqrt(max(values[0], 0))), len(points))
+    residual = float(np.sqrt(max(values[0], 0)))
+    return _Line(normal, float(-normal @ middle), residual, len(points), middle)
 
 
 def _aligned(fits: dict[int, _Line]) -> dict[int, _Line]:
@@ -433,22 +437,47 @@ def _refit(
 
 
 def _jumping(fits: dict[int, _Line], frames: Float64) -> set[int]:
-    """Lines whose direction is off the course of the two lines before and the two after."""
+    """Lines whose direction is off the course of the two lines before and the two after.
+
+    A stick turns evenly with time, or with the way that it goes: a hand that pauses, or turns back,
+    holds its direction meanwhile.
+    """
     order = sorted(fits)
     if len(order) < 5:
         return set()
     angle = np.unwrap([np.arctan2(fits[i].normal[1], fits[i].normal[0]) for i in order])
     at = frames[order]
-    deviation = np.zeros(len(order))
-    for k in range(len(order)):
-        near = [j for j in range(max(k - 2, 0), min(k + 3, len(order))) if j != k]
-        # The course is the neighbours' own, after Theil and Sen; the suspect has no say in it.
-        pairs = [(i, j) for i in near for j in near if i < j]
-        slope = np.median([(angle[j] - angle[i]) / (at[j] - at[i]) for i, j in pairs])
-        expected = np.median(angle[near] - slope * (at[near] - at[k]))
-        deviation[k] = abs(angle[k] - expected)
+    near = [
+        [j for j in range(max(k - 2, 0), min(k + 3, len(order))) if j != k]
+        for k in range(len(order))
+    ]
+    deviation = np.array(
+        [abs(angle[k] - _on_course(at[own] - at[k], angle[own])) for k, own in enumerate(near)]
+    )
     limit = max(_JUMP_RATIO * float(np.median(deviation)), _JUMP_FLOOR)
-    return {order[k] for k in np.nonzero(deviation > limit)[0]}
+
+    def even_on_its_way(k: int) -> bool:
+        line, others = fits[order[k]], [fits[order[j]] for j in near[k]]
+        # How far they lie ahead where its own points are.
+        way = np.array([other.normal @ line.middle + other.offset for other in others])
+        off = abs(angle[k] - _on_course(way, angle[near[k]], _STILL))
+        # Where no line fits, one may well lie between its neighbours by chance.
+        return line.residual <= _POOR_FLOOR and off <= limit
+
+    off_course = np.flatnonzero(deviation > limit).tolist()
+    return {order[k] for k in off_course if not even_on_its_way(k)}
+
+
+def _on_course(at: Float64, values: Float64, least: float = 0.0) -> float:
+    """The value at 0 of the course that those at other places take, after Theil and Sen.
+
+    Args:
+        at: (N,), where the values are.
+        least: places no further apart than this show no slope.
+    """
+    pairs = [(i, j) for i, j in combinations(range(len(at)), 2) if abs(at[j] - at[i]) > least]
+    slopes = [(values[j] - values[i]) / (at[j] - at[i]) for i, j in pairs]
+    return float(np.median(values - (np.median(slopes) if slopes else 0) * at))
 
 
 def _pivot(lines: ShadowLines) -> Float64:

@@ -142,6 +142,17 @@ def test_a_line_whose_direction_jumps_is_replaced_by_its_neighbours() -> None:
     assert errors(lines, sweep)[at] < 0.3
 
 
+@pytest.mark.parametrize("pause", [3, 12])
+def test_a_hand_that_pauses_does_not_make_a_turning_stick_jump(pause: int) -> None:
+    sweep, at = Sweep(0.2, speed=5.0, turn=0.03), 25.0
+    time = edge_times(sweep)
+    paused = np.interp(time, [at, at + 0.2], [0, pause]).astype(np.float32)
+    frames = np.arange(SCENE.frames_of(sweep) + pause, dtype=np.float64)
+    lines = lines_of(time + paused, SCENE.plane, frames)
+    near = np.abs(lines.frame - at - pause / 2) < pause / 2 + 3
+    assert {origin for origin, own in zip(lines.origin, near, strict=True) if own} == {"fit"}
+
+
 @pytest.mark.parametrize(("frames", "replaced"), [(3, True), (15, False)])
 def test_poor_lines_are_replaced_unless_they_are_all_that_there_is(
     frames: int, replaced: bool

@@ -4,6 +4,8 @@ With the epipole known, W[p] = p + s u, u the unit vector towards it: each pass 
 measures the one number s by itself, n·(p + s u) + d = 0, and passes that disagree are outvoted.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,9 +27,22 @@ _DISAGREE, _SETTLED = 12.0, 0.25
 _AGREE = 4.0
 
 
-def measure_parallax(
-    passes: list[Pass], positions: Float32, directions: Float32
-) -> tuple[Float32, Float32]:
+class Parallax(NamedTuple):
+    """What passes tell of s, (H, W) float32 each, pixels.
+
+    Attributes:
+        shift: s; NaN unknown.
+        deviation: its standard deviation, as far as each pixel has its own; infinite unknown.
+        common: what s is off, in the root mean square, with the lines that it was measured by:
+            pixels around it are by the same; infinite unknown.
+    """
+
+    shift: Float32
+    deviation: Float32
+    common: Float32
+
+
+def measure_parallax(passes: list[Pass], positions: Float32, directions: Float32) -> Parallax:
     """What the passes' own times tell of s, pixel by pixel.
 
     Args:
@@ -35,44 +50,56 @@ def measure_parallax(
         positions, directions: (H, W, 2), p and u.
 
     Returns:
-        s and its standard deviation, pixels, (H, W) float32 each; NaN and infinite where fewer than
-        two passes reached the pixel, or none measures it.
+        s; unknown where fewer than two passes reached the pixel, or none measures it.
     """
     shape = positions.shape[:2]
-    shift, deviation = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    found = Parallax(*(np.empty(shape, np.float32) for _ in range(3)))
     for rows in bands(shape):
         own = [scan.part(rows) for scan in passes]
-        part = _measured(own, positions[rows], directions[rows])
-        shift[rows], deviation[rows] = part
-    return shift, deviation
+        for whole, part in zip(
+            found, _measured(own, positions[rows], directions[rows]), strict=True
+        ):
+            whole[rows] = part
+    return found
 
 
-def _measured(
-    passes: list[Pass], positions: Float32, directions: Float32
-) -> tuple[Float32, Float32]:
+def _measured(passes: list[Pass], positions: Float32, directions: Float32) -> Parallax:
     measured = [_one(scan, positions, directions) for scan in passes]
-    shift = np.stack([m[0] for m in measured])
-    weight = np.stack([m[1] for m in measured])
-    weight = _without_outvoted(shift, weight)
-    reached = np.sum([m[2] for m in measured], axis=0)
+    shift = np.stack([one.shift for one in measured])
+    weight = _without_outvoted(shift, np.stack([one.weight for one in measured]))
+    reached = np.sum([one.reached for one in measured], axis=0)
     count = (weight > 0).sum(axis=0)
     total = weight.sum(axis=0)
     safe = np.maximum(total, 1e-12)
     mean = (weight * shift).sum(axis=0) / safe
     scatter = (weight * (shift - mean) ** 2).sum(axis=0) / np.maximum(count - 1, 1)
     variance = np.maximum(scatter / _AGREE, 1) / safe
+    off_lines = np.stack([one.off_line for one in measured])
+    common = np.sqrt(((weight * off_lines) ** 2).sum(axis=0)) / safe
     known = (reached >= 2) & (count > 0)
-    return (
+    return Parallax(
         np.where(known, mean, np.nan).astype(np.float32),
         np.where(known, np.sqrt(variance), np.inf).astype(np.float32),
+        np.where(known, common, np.inf).astype(np.float32),
     )
 
 
-def _one(
-    scan: Pass, positions: Float32, directions: Float32
-) -> tuple[Float64, Float64, NDArray[np.bool_]]:
-    """One pass's s, the inverse of its variance, which is 0 where it measures none, and which
-    pixels it reached."""
+class _One(NamedTuple):
+    """What one pass tells, (H, W) each.
+
+    Attributes:
+        weight: the inverse of the variance of ``shift``; 0 where it measures none.
+        off_line: by how much ``shift`` is off with a line that is off by its residual, pixels.
+        reached: the pixels that the pass reached.
+    """
+
+    shift: Float64
+    weight: Float64
+    off_line: Float64
+    reached: NDArray[np.bool_]
+
+
+def _one(scan: Pass, positions: Float32, directions: Float32) -> _One:
     time, error = scan.times.own_time, scan.times.own_error
     known = np.isfinite(time)
     lines = interpolate_lines(scan.lines, time[known].astype(np.float64))
@@ -87,10 +114,11 @@ def _one(
     passed = positions[known] + along[:, np.newaxis] * directions[known]
     pace = line_pace(scan.lines, lines.frame[inside], passed)
     variance = (error[known] * pace) ** 2 + lines.residual[inside] ** 2 + _LEAST_RESIDUAL**2
-    shift, weight = np.zeros(time.shape), np.zeros(time.shape)
+    shift, weight, off_line = (np.zeros(time.shape) for _ in range(3))
     shift[known] = along
     weight[known] = np.where(usable, across**2 / variance, 0)
-    return shift, weight, known
+    off_line[known] = lines.residual[inside] / np.abs(across)
+    return _One(shift, weight, off_line, known)
 
 
 def _without_outvoted(shift: Float64, weight: Float64) -> Float64:

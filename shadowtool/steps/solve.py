@@ -16,6 +16,7 @@ from shadowtool.parallel import ordered_map
 from shadowtool.steps.run import Progress, no_progress
 
 Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
 
 # About so many pixels are enough to find the light's image.
 _THIN = 200_000
@@ -90,17 +91,14 @@ def _light(passes: list[Pass], positions: Float32) -> tuple[Epipole | None, int 
     every = max(1, math.isqrt(positions.shape[0] * positions.shape[1] // _THIN))
     thin = slice(None, None, every)
     parts, here = [scan.part(thin, thin) for scan in passes], positions[thin, thin]
-    marked = [scan.plane for scan in parts if scan.plane is not None]
-    plane = np.zeros(here.shape[:2], bool)
-    if marked:
-        plane = np.mean(marked, axis=0) > _MOSTLY
+    plane = _marked(parts)
 
     def seen_by(some: list[Pass]) -> Epipole | None:
         found = intersect(some, here)
         off_plane = np.where(plane, np.float32(np.inf), found.error)
         epipole = find_epipole(found.warp, off_plane, here)
         # A mark may be drawn over all that stands on the plane.
-        return epipole or (find_epipole(found.warp, found.error, here) if marked else None)
+        return epipole or (find_epipole(found.warp, found.error, here) if plane.any() else None)
 
     everything = seen_by(parts)
     if len(parts) < 3 or (everything is not None and everything.miss <= _MISSED):
@@ -115,6 +113,14 @@ def _light(passes: list[Pass], positions: Float32) -> tuple[Epipole | None, int 
         worse = min(worse, everything.miss)
     agreed = misses[best] < _WRONG * worse and (everything is not None or misses[best] <= _MISSED)
     return (without[best], best) if agreed else (everything, None)
+
+
+def _marked(passes: list[Pass]) -> Bool:
+    """(H, W), what most passes that have a mark have marked as the reference plane."""
+    marks = [scan.plane for scan in passes if scan.plane is not None]
+    if not marks:
+        return np.zeros(passes[0].times.time.shape, bool)
+    return np.asarray(np.mean(marks, axis=0) > _MOSTLY, bool)
 
 
 def _usual_pace(scan: Pass) -> float:
@@ -134,8 +140,12 @@ def _towards(
     wanted: slice,
 ) -> WarpMap:
     directions = epipole.directions(positions)
-    shift, error = measure_parallax(passes, positions, directions)
-    shift, error = fit_planes(shift, error, windows, wanted)
+    measured = measure_parallax(passes, positions, directions)
+    shift, error = fit_planes(measured.shift, measured.deviation, windows, wanted)
+    # What lines are off does not average out among pixels that have them in common. On the plane,
+    # whose own pixels they were fitted to, that is what these deviate by.
+    off_plane = ~_marked(passes)[wanted]
+    error[off_plane] = np.hypot(error[off_plane], measured.common[wanted][off_plane])
     return WarpMap(positions[wanted] + shift[..., None] * directions[wanted], error)
 
 

@@ -17,7 +17,8 @@ DIRECTIONS = np.broadcast_to(
 
 
 def measured(scans: list[Pass]) -> tuple[np.ndarray, np.ndarray]:
-    return measure_parallax(scans, POSITIONS, DIRECTIONS)
+    found = measure_parallax(scans, POSITIONS, DIRECTIONS)
+    return found.shift, found.deviation
 
 
 @pytest.mark.parametrize("angles", [(0.2, 1.7), (0.2, 1.3, 2.4)])

@@ -110,6 +110,31 @@ def test_passes_that_agree_are_all_used() -> None:
     assert np.isfinite(solved.warp_map.error).mean() >= np.isfinite(two.warp_map.error).mean()
 
 
+def wavy_pass(sweep: Sweep, waves: float) -> Pass:
+    """A pass whose edge is off the straight by waves, pixels, too long for windows to see."""
+    normal, _ = SCENE.edge(sweep, 0)
+
+    def off(warp: np.ndarray) -> np.ndarray:
+        return (waves / sweep.speed * np.sin(warp @ [-normal[1], normal[0]] / 9)).astype(np.float32)
+
+    frames = np.arange(SCENE.frames_of(sweep), dtype=np.float64)
+    lines = lines_of(passed(sweep, HERE) + off(HERE), SCENE.plane, frames)
+    time = passed(sweep, SCENE.warp) + off(SCENE.warp)
+    return Pass(ShadowTimes.alone(time, np.ones_like(time), 0.02), lines, SCENE.plane)
+
+
+def test_what_edges_are_off_the_straight_is_predicted_off_the_plane() -> None:
+    straight, wavy = (
+        solve([wavy_pass(sweep, waves) for sweep in SWEEPS]).warp_map for waves in (0.0, 0.4)
+    )
+    for found in (straight, wavy):
+        off = np.linalg.norm(found.warp - SCENE.warp, axis=-1)
+        within = (off < 2 * found.error)[~SCENE.plane & np.isfinite(found.error)]
+        assert within.mean() > 0.7
+    assert np.median(straight.error[~SCENE.plane]) < 0.1
+    assert np.median(wavy.error[SCENE.plane]) < 0.1
+
+
 def test_where_nothing_stands_on_the_plane_there_is_no_light_and_no_pass_is_wrong() -> None:
     passes = [pass_of(sweep, HERE) for sweep in SWEEPS]
     rng = np.random.default_rng(0)

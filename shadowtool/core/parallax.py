@@ -6,15 +6,17 @@ measures the one number s by itself, n·(p + s u) + d = 0, and passes that disag
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
 from shadowtool.core.shadow_lines import interpolate_lines, line_pace
-from shadowtool.core.warp_map import Pass
+from shadowtool.core.warp_map import Pass, WarpMap, identity_map
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 # Lines nearer than this to the direction of the displacement, as a cosine, do not measure it.
 _ALONG = 0.05
@@ -25,6 +27,14 @@ _LEAST_RESIDUAL = 0.05
 _DISAGREE, _SETTLED = 12.0, 0.25
 # A squared deviation in its own units up to which the error of the mean stays as it is.
 _AGREE = 4.0
+# What no other pass checks counts as worse known by this factor, and by this, pixels, besides.
+_ALONE, _LEAST_ALONE = 2.0, 0.5
+# Where the slope of displacements changes by more than this, pixels, a surface ends; displacements
+# up to this are the plane's.
+_STEP = 1.5
+# A surface is believed if two passes or more tell of so many of its pixels, and of this part.
+_LEAST_CHECKED, _CHECKED = 50, 1 / 3
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 
 
 class Parallax(NamedTuple):
@@ -50,7 +60,7 @@ def measure_parallax(passes: list[Pass], positions: Float32, directions: Float32
         positions, directions: (H, W, 2), p and u.
 
     Returns:
-        s; unknown where fewer than two passes reached the pixel, or none measures it.
+        s; unknown where no pass measures it.
     """
     shape = positions.shape[:2]
     found = Parallax(*(np.empty(shape, np.float32) for _ in range(3)))
@@ -74,9 +84,10 @@ def _measured(passes: list[Pass], positions: Float32, directions: Float32) -> Pa
     mean = (weight * shift).sum(axis=0) / safe
     scatter = (weight * (shift - mean) ** 2).sum(axis=0) / np.maximum(count - 1, 1)
     variance = np.maximum(scatter / _AGREE, 1) / safe
+    variance = np.where(reached < 2, _ALONE**2 * variance + _LEAST_ALONE**2, variance)
     off_lines = np.stack([one.off_line for one in measured])
     common = np.sqrt(((weight * off_lines) ** 2).sum(axis=0)) / safe
-    known = (reached >= 2) & (count > 0)
+    known = count > 0
     return Parallax(
         np.where(known, mean, np.nan).astype(np.float32),
         np.where(known, np.sqrt(variance), np.inf).astype(np.float32),
@@ -96,29 +107,62 @@ class _One(NamedTuple):
     shift: Float64
     weight: Float64
     off_line: Float64
-    reached: NDArray[np.bool_]
+    reached: Bool
 
 
 def _one(scan: Pass, positions: Float32, directions: Float32) -> _One:
-    time, error = scan.times.own_time, scan.times.own_error
-    known = np.isfinite(time)
+    time, error, known = scan.times.own_time, scan.times.own_error, scan.reached
     lines = interpolate_lines(scan.lines, time[known].astype(np.float64))
-    inside = np.isfinite(lines.offset)
-    known[known] = inside
-    normal, offset = lines.normal[inside], lines.offset[inside]
-    across = (normal * directions[known]).sum(axis=-1)
-    distance = -(normal * positions[known]).sum(axis=-1) - offset
+    across = (lines.normal * directions[known]).sum(axis=-1)
+    distance = -(lines.normal * positions[known]).sum(axis=-1) - lines.offset
     usable = np.abs(across) > _ALONG
     across = np.where(usable, across, 1)
     along = np.where(usable, distance / across, 0)
     passed = positions[known] + along[:, np.newaxis] * directions[known]
-    pace = line_pace(scan.lines, lines.frame[inside], passed)
-    variance = (error[known] * pace) ** 2 + lines.residual[inside] ** 2 + _LEAST_RESIDUAL**2
+    pace = line_pace(scan.lines, lines.frame, passed)
+    variance = (error[known] * pace) ** 2 + lines.residual**2 + _LEAST_RESIDUAL**2
     shift, weight, off_line = (np.zeros(time.shape) for _ in range(3))
     shift[known] = along
     weight[known] = np.where(usable, across**2 / variance, 0)
-    off_line[known] = lines.residual[inside] / np.abs(across)
+    off_line[known] = lines.residual / np.abs(across)
     return _One(shift, weight, off_line, known)
+
+
+def without_unchecked(found: WarpMap, passes: list[Pass], plane: Bool) -> WarpMap:
+    """W without what a single pass tells, but where it goes on from what two or more tell.
+
+    A pass takes all that darkens a pixel for the edge's shadow, a hand that passes before it, too.
+    Where no other pass checks that, the surface does that the pixel would lie on: one that others
+    tell enough of, without a step between; or the plane, if it was marked.
+
+    Args:
+        found: W as measured, (H, W); NaN unknown.
+        passes: those that check each other.
+        plane: (H, W), what is marked as the reference plane.
+    """
+    height, width = found.error.shape
+    displacement = found.warp - identity_map(height, width)
+    known = np.isfinite(found.error)
+    checked = np.sum([scan.reached for scan in passes], axis=0, dtype=np.uint8) >= 2
+    smooth = known & ~plane
+    for axis, inner in ((0, np.s_[1:-1]), (1, np.s_[:, 1:-1])):
+        # A slope may be as steep as it likes.
+        smooth[inner] &= ~(np.linalg.norm(np.diff(displacement, 2, axis), axis=-1) > _STEP)
+    count, surfaces = cv2.connectedComponents(smooth.view(np.uint8), connectivity=4)
+    size, sure = (
+        np.bincount(surfaces[part], minlength=count) for part in (smooth, smooth & checked)
+    )
+    believed = ((sure >= _LEAST_CHECKED) & (sure >= _CHECKED * size))[surfaces] & smooth
+    # At a step the slope changes in the last pixel of either surface, at a lone error in five.
+    believed = cv2.dilate(believed.view(np.uint8), _CROSS) > 0
+    on_plane = np.linalg.norm(displacement, axis=-1) <= _STEP
+    left = known & (checked | np.where(plane, on_plane, believed))
+    # Two passes meet in lone pixels by chance.
+    left &= cv2.boxFilter(left.astype(np.uint8), -1, (3, 3), normalize=False) > 1
+    lost = known & ~left
+    warp, error = found.warp.copy(), found.error.copy()
+    warp[lost], error[lost] = np.nan, np.inf
+    return WarpMap(warp, error)
 
 
 def _without_outvoted(shift: Float64, weight: Float64) -> Float64:

@@ -60,6 +60,12 @@ class Pass:
     lines: ShadowLines
     plane: Bool | None = None
 
+    @property
+    def reached(self) -> Bool:
+        """(H, W), where the edge passed at a time at which it lay on the plane."""
+        own, frame = self.times.own_time, self.lines.frame
+        return np.asarray((own >= frame[0]) & (own <= frame[-1]), bool)
+
     def part(self, rows: slice, columns: slice = slice(None)) -> "Pass":
         """The same scan of a part of the picture; the lines keep the whole's coordinates."""
         parts = {f.name: getattr(self.times, f.name)[rows, columns] for f in fields(self.times)}

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.epipole import Epipole, find_epipole
-from shadowtool.core.parallax import measure_parallax
+from shadowtool.core.parallax import measure_parallax, without_unchecked
 from shadowtool.core.plane_fits import Windows, fit_planes
 from shadowtool.core.shadow_lines import line_pace
 from shadowtool.core.warp_map import Pass, WarpMap, identity_map, intersect, without_slips
@@ -46,7 +46,8 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
 
     Where nothing stands on the plane, or where the displacements agree on no light's image, W is
     the intersection in two dimensions. A pass that does not agree with two others or more is used
-    only where these say nothing.
+    only where these say nothing. With the light's image one pass is believed by itself where what
+    it tells goes on from what others do.
 
     Args:
         passes: two or more, all of one size.
@@ -79,6 +80,8 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
     for done, (rows, part) in enumerate(ordered_map(band, cuts, jobs), start=1):
         whole.warp[rows], whole.error[rows] = part.warp, part.error
         progress(done, len(cuts))
+    if epipole is not None:
+        whole = without_unchecked(whole, used, _marked(used))
     return Solved(without_slips(whole), epipole, left_out)
 
 

@@ -80,6 +80,17 @@ def test_where_the_others_say_nothing_a_pass_that_was_left_out_is_used() -> None
     assert off_block(solved) < 0.2
 
 
+def test_a_part_of_a_block_that_one_pass_reached_is_measured() -> None:
+    passes = [pass_of(sweep, SCENE.warp) for sweep in SWEEPS]
+    for scan in passes[1:]:
+        scan.times.time[:, 85:] = scan.times.own_time[:, 85:] = np.nan
+    found = solve(passes).warp_map
+    part = ~SCENE.plane
+    part[:, :85] = False
+    assert np.isfinite(found.error[part]).mean() > 0.99
+    assert np.nanmax(np.linalg.norm(found.warp - SCENE.warp, axis=-1)[part]) < 0.5
+
+
 def test_a_mark_that_is_drawn_over_everything_hides_no_light() -> None:
     passes = [pass_of(sweep, SCENE.warp) for sweep in SWEEPS]
     everything = np.ones_like(SCENE.plane)

@@ -426,14 +426,18 @@ def _advise(figures: Figures, footage: Footage) -> None:
             take,
             100 * reached,
         )
+    trembles = figures["trembling"] > UNSTEADY
     if figures["errors_raised"] > _TREMBLING:
         logger.warning(
-            "%s: times on the plane differ by %.1f times what noise explains; a camera that"
-            " trembles or a codec does that, fix it or stabilize the take",
+            "%s: times on the plane differ by %.1f times what noise explains; %s",
             take,
             figures["errors_raised"],
+            "a camera that trembles or a codec does that, fix it or stabilize the take"
+            if trembles
+            else "an uneven pace, steps larger than the shadow is wide, or a codec does that;"
+            " sweep evenly and more slowly, with a wider board",
         )
-    if figures["trembling"] > UNSTEADY:
+    if trembles:
         logger.warning(
             "%s: the camera trembles by %.2f pixels; %s",
             take,
@@ -445,9 +449,10 @@ def _advise(figures: Figures, footage: Footage) -> None:
     if figures["off_lines"] > _MANY_OFF:
         logger.warning(
             "%s: %.0f%% of the plane lies off the edge's lines; a board that is bent, a stick that"
-            " is too narrow, a camera that trembles, or something else that crosses does that",
+            " is too narrow, %s, or something else that crosses does that",
             take,
             100 * figures["off_lines"],
+            "a camera that trembles" if trembles else "an uneven pace",
         )
     if figures["beyond_lines"] > _BEYOND:
         logger.warning(

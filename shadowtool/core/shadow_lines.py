@@ -38,8 +38,9 @@ _LONGEST_RUN = 4
 _JUMP_RATIO, _JUMP_FLOOR = 5.0, np.radians(0.75)
 # Lines that lie no further apart than this, pixels, stand still.
 _STILL = 0.5
-# About so many pixels tell how far they are off their lines.
-_SOME_PLACES = 50_000
+# About so many pixels tell how far they are off their lines, and are so by more than this, pixels,
+# only if something is wrong.
+_SOME_PLACES, _OFF = 50_000, 2.0
 # Bends are looked for in about so many lines, and told from so many.
 _BENT_LINES, _LEAST_BENT = 24, 5
 
@@ -197,6 +198,13 @@ def off_lines(time: Float32, plane: NDArray[np.bool_], lines: ShadowLines) -> Fl
     own = interpolate_lines(lines, time[places].astype(np.float64))
     distance = np.abs((own.normal * np.stack(places[::-1], axis=-1)).sum(axis=-1) + own.offset)
     return np.asarray(distance[np.isfinite(distance)], np.float32)
+
+
+def part_off_lines(time: Float32, plane: NDArray[np.bool_], lines: ShadowLines) -> float:
+    """The part of the plane's pixels that are off their lines by more than measuring makes them, as
+    of `off_lines`; 0 if there are none."""
+    distance = off_lines(time, plane, lines)
+    return float((distance > _OFF).mean()) if distance.size else 0.0
 
 
 def some_of(region: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -22,7 +22,7 @@ from shadowtool.core.shadow_lines import (
     fit_shadow_lines,
     line_bend,
     line_pace,
-    off_lines,
+    part_off_lines,
     some_of,
     zero_crossings,
 )
@@ -78,9 +78,8 @@ _LITTLE, _FAST = 0.5, 20.0
 # Times differ by so many times what noise explains only if something is wrong; and by so many,
 # with less than this part of the edges on lines, only if what moved is no straight shadow.
 _TREMBLING, _NO_SWEEP, _ON_LINES = 2.0, 4.0, 0.5
-# Pixels of the plane are off the lines of their times by more than this, pixels; and so many are
-# only if something is wrong.
-_OFF, _MANY_OFF = 2.0, 0.06
+# So many pixels of the plane are off the lines of their times only if something is wrong.
+_MANY_OFF = 0.06
 # More than this of what a sweep reached has times at which no edge lay on the plane only if too
 # little of the plane is marked.
 _BEYOND = 0.3
@@ -191,12 +190,11 @@ def scan(
         make_folder(output)
         with meanwhile(lambda: write_png(output / PICTURE, draw(), provenance)) as drawn:
             bend = line_bend(points, numbers, lines, footage.header.size)
-            off = off_lines(times.time, region, lines) > _OFF
             figures = _figures(times, lines, region, gains, bend) | {
                 "skipped": frame_range(skipped),
                 "errors_raised": round(raised, 2),
                 "trembling": round(trembling, 3),
-                "off_lines": round(float(off.mean()), 4) if off.size else 0.0,
+                "off_lines": round(part_off_lines(times.time, region, lines), 4),
             }
             _advise(figures, footage)
             write_scan(output, Pass(times, lines, region), footage.header, provenance, encoded())

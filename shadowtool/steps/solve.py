@@ -81,7 +81,7 @@ def solve(passes: list[Pass], jobs: int | None = None, progress: Progress = no_p
         whole.warp[rows], whole.error[rows] = part.warp, part.error
         progress(done, len(cuts))
     if epipole is not None:
-        whole = without_unchecked(whole, used, _marked(used))
+        whole = without_unchecked(whole, used, marked(used))
     return Solved(without_slips(whole), epipole, left_out)
 
 
@@ -94,7 +94,7 @@ def _light(passes: list[Pass], positions: Float32) -> tuple[Epipole | None, int 
     every = max(1, math.isqrt(positions.shape[0] * positions.shape[1] // _THIN))
     thin = slice(None, None, every)
     parts, here = [scan.part(thin, thin) for scan in passes], positions[thin, thin]
-    plane = _marked(parts)
+    plane = marked(parts)
 
     def seen_by(some: list[Pass]) -> Epipole | None:
         found = intersect(some, here)
@@ -118,7 +118,7 @@ def _light(passes: list[Pass], positions: Float32) -> tuple[Epipole | None, int 
     return (without[best], best) if agreed else (everything, None)
 
 
-def _marked(passes: list[Pass]) -> Bool:
+def marked(passes: list[Pass]) -> Bool:
     """(H, W), what most passes that have a mark have marked as the reference plane."""
     marks = [scan.plane for scan in passes if scan.plane is not None]
     if not marks:
@@ -147,7 +147,7 @@ def _towards(
     shift, error = fit_planes(measured.shift, measured.deviation, windows, wanted)
     # What lines are off does not average out among pixels that have them in common. On the plane,
     # whose own pixels they were fitted to, that is what these deviate by.
-    off_plane = ~_marked(passes)[wanted]
+    off_plane = ~marked(passes)[wanted]
     error[off_plane] = np.hypot(error[off_plane], measured.common[wanted][off_plane])
     return WarpMap(positions[wanted] + shift[..., None] * directions[wanted], error)
 

@@ -15,6 +15,7 @@ from shadowtool.core.epipole import Epipole
 from shadowtool.core.half_floats import LARGEST_HALF, not_finite, to_float, to_half
 from shadowtool.core.inverse_map import compose, invert
 from shadowtool.core.pictures import warp_picture
+from shadowtool.core.shadow_lines import part_off_lines
 from shadowtool.core.warp_map import (
     LEAST_ANGLE,
     Pass,
@@ -61,7 +62,7 @@ from shadowtool.steps.run import (
     with_figures,
     write_manifest,
 )
-from shadowtool.steps.solve import solve
+from shadowtool.steps.solve import marked, solve
 
 logger = logging.getLogger(__name__)
 
@@ -72,6 +73,12 @@ PICTURE = "warp.png"
 _LEAST_KNOWN, _WORST_ERROR = 0.05, 8.0
 # Displacements of more pixels than this have a direction that can be told.
 _DISPLACED = 8.0
+# If displacements have none in common, and more of the plane than this lies off the edge's lines,
+# it was no edge that passed.
+_ASTRAY = 0.2
+# More of what sweeps reached off the plane than this is filled in only if single ones reached it,
+# or if it was no shadow that did; told if they reached more of the frame there than this.
+_UNCONFIRMED, _LEAST_REACHED = 0.25, 0.02
 # A file that takes up more than this part of its pixels' room holds grain.
 _GRAIN = 0.5
 
@@ -212,9 +219,40 @@ class _Scans:
                 f" ({', '.join(self.labels)}); sweep more slowly, with a straighter edge"
             )
         figures = _figures(self.labels, self.passes, measured, epipole)
+        self._require_shadows(figures, output)
         figures["left_out"] = None if left_out is None else self.labels[left_out]
+        if figures["unconfirmed"] > _UNCONFIRMED:
+            logger.warning(
+                "%s: of what sweeps reached off the marked plane %.0f%% is filled in, as no two of"
+                " them agree there; let two or more cross all that stands on it, and stay out of"
+                " the picture",
+                output,
+                100 * figures["unconfirmed"],
+            )
         self.passes.clear()
         return measured, figures
+
+    def _require_shadows(self, figures: Figures, output: Path) -> None:
+        """Refuse sweeps in which something else than an edge's shadow passed.
+
+        Lines may be fitted to what hides the plane, too, but much of that doesn't lie on them, and
+        what is displaced by it is displaced anywhere.
+        """
+        furthest = figures["displacement"]["p99"]
+        if figures["light"] is not None or furthest <= _DISPLACED:
+            return
+        off = [
+            0.0 if scan.plane is None else part_off_lines(scan.times.time, scan.plane, scan.lines)
+            for scan in self.passes
+        ]
+        worst = max(range(len(off)), key=off.__getitem__)
+        if off[worst] > _ASTRAY:
+            raise ReshootError(
+                f"{output}: reshoot: the shadow is displaced by up to {furthest:.0f} pixels, but"
+                f" not towards one place, as by one light, and {off[worst]:.0%} of the plane lies"
+                f" off the edge's lines in {self.folders[worst]}; sweep a straight stick whose"
+                " shadow reaches across all of the plane, and stay out of the picture"
+            )
 
 
 def _open_scans(folders: list[Path], beside: tuple[Header, str] | None = None) -> _Scans:
@@ -401,6 +439,8 @@ def _figures(
         },
         "known": round(float(known.mean()), 4),
         "filled": round(float(1 - known.mean()), 4),
+        # Of what sweeps reached off the plane, and what is filled in all the same.
+        "unconfirmed": round(_unconfirmed(passes, known), 4),
         "angles_degrees": {
             f"{names[i]} {names[j]}": round(math.degrees(angle), 1)
             for i, j, angle in pass_angles(passes)
@@ -421,6 +461,13 @@ def _figures(
             "p99": round(float(np.percentile(displacement, 99)), 3),
         },
     }
+
+
+def _unconfirmed(passes: list[Pass], known: np.ndarray) -> float:
+    """The part of what sweeps reached off the plane where W is not known; 0 if that is little."""
+    reached = reduce(np.logical_or, (np.isfinite(scan.times.time) for scan in passes))
+    reached &= ~marked(passes)
+    return float(1 - known[reached].mean()) if reached.mean() > _LEAST_REACHED else 0.0
 
 
 def _gray(passes: list[Pass]) -> np.ndarray:

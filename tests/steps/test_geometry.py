@@ -111,6 +111,32 @@ def test_displacements_towards_no_one_place_are_told_of(
     (result,) = warp(scans, tmp_path / "none")
     assert "not towards one place" in caplog.text
     assert result.figures["light"] is None
+    # Much of the plane passed by something else.
+    bad, header, _ = read_scan(scans[1])
+    bad.times.time[:30] += 3
+    (tmp_path / "bad").mkdir()
+    write_scan(tmp_path / "bad", bad, header, {})
+    with pytest.raises(ReshootError, match=r"off the edge's lines in .*bad; sweep a straight"):
+        warp([scans[0], tmp_path / "bad"], tmp_path / "refused")
+    assert not (tmp_path / "refused").exists()
+
+
+@pytest.mark.parametrize(("last", "told"), [(100, False), (90, False), (66, True)])
+def test_what_stands_where_no_two_sweeps_agree_is_told_of(
+    scans: list[Path], tmp_path: Path, caplog: pytest.LogCaptureFixture, last: int, told: bool
+) -> None:
+    folders = [scans[0]]
+    for folder in scans[1:]:
+        found, header, _ = read_scan(folder)
+        missed = ~SCENE.plane
+        missed[:, :last] = False
+        found.times.time[missed] = found.times.own_time[missed] = np.nan
+        folders.append(tmp_path / folder.name)
+        folders[-1].mkdir()
+        write_scan(folders[-1], found, header, {})
+    (result,) = warp(folders, tmp_path / "map")
+    unconfirmed = f"marked plane {100 * result.figures['unconfirmed']:.0f}% is filled in"
+    assert (unconfirmed in caplog.text) == told == (result.figures["unconfirmed"] > 0.5)
 
 
 def test_a_hand_may_be_now_fast_and_now_slow(tmp_path: Path, mask: str) -> None:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from shadowtool.core.transfer import encode_srgb
-from shadowtool.core.warp_map import resample
+from shadowtool.core.warp_map import positions, sample
 from shadowtool.io.image import read_image, write_png
 from shadowtool.io.products import read_plates, read_warp
 
@@ -41,7 +41,9 @@ def psnr(one: np.ndarray, other: np.ndarray, where: np.ndarray) -> float:
 def shadow_region(truth: Path, frame: int) -> np.ndarray:
     """Where the true shadow of a frame falls on the target, but for what the figure covers."""
     warp, _, _ = read_warp(truth / "warp.exr")
-    beta = resample(read_image(truth / f"beta.{frame}.exr").plane("Y"), warp.warp, outside=1.0)
+    beta = sample(
+        read_image(truth / f"beta.{frame}.exr").plane("Y"), positions(warp.warp), outside=1.0
+    )
     alpha = read_image(truth / f"alpha.{frame}.exr").plane("Y")
     return (beta < 1 - TOUCHED) & (alpha == 0)
 

@@ -220,20 +220,6 @@ def pass_angles(passes: list[Pass]) -> list[tuple[int, int, float]]:
     return angles
 
 
-def resample(image: NDArray[np.floating], warp: Float32, outside: float) -> Float32:
-    """The image as the map sees it: image[W[p]], bilinear (section 4).
-
-    Args:
-        image: (H, W) or (H, W, C).
-        warp: (H', W', 2) float32, pixels; where NaN the result is ``outside``.
-        outside: the value beyond the image's edge.
-
-    Returns:
-        (H', W') or (H', W', C) float32.
-    """
-    return sample(image, positions(warp), outside)
-
-
 def positions(warp: Float32) -> Float32:
     """W as `sample` takes it, (H', W', 2) float32: far outside instead of NaN.
 
@@ -246,11 +232,17 @@ def positions(warp: Float32) -> Float32:
 def sample(
     image: NDArray[np.floating], places: Float32, outside: float, unknown: Bool | None = None
 ) -> Float32:
-    """`resample` by what `positions` gave: for one map and many pictures.
+    """The image as a map sees it: image[W[p]], bilinear (section 4).
 
     Args:
+        image: (H, W) or (H, W, C).
+        places: (H', W', 2), of `positions`.
+        outside: the value beyond the image's edge, and where W is unknown.
         unknown: (H, W), where the image is not to be gone by. What lies half or more on such
             pixels is NaN, the rest is made of the others; None for nowhere.
+
+    Returns:
+        (H', W') or (H', W', C) float32.
     """
     values = to_float(image)
     if unknown is None:

@@ -23,7 +23,6 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from shadowtool.core.half_floats import to_float
-from shadowtool.core.half_floats import to_half as to_half
 from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import DamagedFileError, InputError, RetryError, ShadowtoolError
 from shadowtool.io import scanlines

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from shadowtool.choices import Format
 from shadowtool.core import camera_motion
-from shadowtool.core.half_floats import LARGEST_HALF, not_finite
+from shadowtool.core.half_floats import LARGEST_HALF, not_finite, to_half
 from shadowtool.core.noise import NoiseSamples, noise_levels, thin
 from shadowtool.core.resizing import resized
 from shadowtool.core.shadow_time import luminance
@@ -24,7 +24,7 @@ from shadowtool.errors import (
     ReshootError,
 )
 from shadowtool.io.files import new_folders, real
-from shadowtool.io.image import EXR, PNG, Header, to_code, to_half, write_exr, write_png
+from shadowtool.io.image import EXR, PNG, Header, to_code, write_exr, write_png
 from shadowtool.io.products import MANIFEST, folder_lock, read_record, write_json
 from shadowtool.io.sequence import Frame, frame_file, frame_range
 from shadowtool.parallel import ordered_map

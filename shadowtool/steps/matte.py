@@ -26,7 +26,7 @@ from shadowtool.core.exposure import (
     without_gain,
 )
 from shadowtool.core.grid import exposure_rows, exposure_step, on_grid
-from shadowtool.core.half_floats import not_finite, to_float
+from shadowtool.core.half_floats import not_finite, to_float, to_half
 from shadowtool.core.matting import (
     HIDDEN,
     MARGIN,
@@ -41,7 +41,7 @@ from shadowtool.core.trembling import UNSTEADY, off_place, strips
 from shadowtool.core.trimap import FIGURE
 from shadowtool.errors import InputError, OptionError
 from shadowtool.io.files import real
-from shadowtool.io.image import EXR, PNG, Header, Image, read_image, to_half, write_exr, write_png
+from shadowtool.io.image import EXR, PNG, Header, Image, read_image, write_exr, write_png
 from shadowtool.io.products import BETA_FOLDER, FIGURE_FOLDER, TRIMAP_FOLDER, made_by, read_plates
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
 from shadowtool.steps.footage import (

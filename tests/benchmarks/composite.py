@@ -18,7 +18,7 @@ import numpy as np
 from shadowtool.core.beta import inverse_span, shadow_matte
 from shadowtool.core.compositing import shade
 from shadowtool.core.transfer import encode_srgb
-from shadowtool.core.warp_map import resample
+from shadowtool.core.warp_map import positions, sample
 from shadowtool.io.image import read_image
 from shadowtool.io.products import WARP, read_plates, read_warp
 from shadowtool.steps.matte import matte
@@ -45,7 +45,7 @@ class Maps(NamedTuple):
     warp: np.ndarray
 
     def background(self, frame: int) -> np.ndarray:
-        visibility = resample(self.betas[frame], self.warp, outside=1.0)
+        visibility = sample(self.betas[frame], positions(self.warp), outside=1.0)
         return shade(self.lit, self.shadow, visibility)
 
 
@@ -95,7 +95,7 @@ def decibels(scene: str, maps: Maps, true: Maps) -> float:
     key = (true.lit - true.shadow).sum(axis=-1) > _LIT * true.lit.sum(axis=-1)
     values = []
     for frame in maps.betas:
-        shaded = resample(true.betas[frame], true.warp, outside=1.0) < _TOUCHED
+        shaded = sample(true.betas[frame], positions(true.warp), outside=1.0) < _TOUCHED
         hidden = load(target / f"reference_alpha.{frame}.exr") > 0
         where = shaded & ~hidden & key
         reference = load(target / f"reference.{frame}.exr")

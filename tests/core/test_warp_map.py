@@ -15,7 +15,6 @@ from shadowtool.core.warp_map import (
     intersect,
     pass_angles,
     positions,
-    resample,
     sample,
     to_st_map,
     without_slips,
@@ -203,13 +202,13 @@ def test_what_is_unknown_is_left_and_is_no_neighbour() -> None:
 
 def test_the_identity_resamples_to_the_same_picture() -> None:
     image = np.random.default_rng(0).uniform(size=(9, 13)).astype(np.float32)
-    assert resample(image, identity_map(9, 13), 1.0) == pytest.approx(image, abs=1e-6)
+    assert sample(image, positions(identity_map(9, 13)), 1.0) == pytest.approx(image, abs=1e-6)
 
 
 def test_resampling_is_bilinear() -> None:
     ramp = np.tile(np.arange(10, dtype=np.float32), (10, 1))
     warp = identity_map(10, 10)[:, :8] + np.float32([0.37, 0.0])
-    assert resample(ramp, warp, 0.0) == pytest.approx(warp[..., 0], abs=1e-5)
+    assert sample(ramp, positions(warp), 0.0) == pytest.approx(warp[..., 0], abs=1e-5)
 
 
 def test_outside_the_frame_and_where_the_map_is_unknown_is_lit() -> None:
@@ -219,12 +218,12 @@ def test_outside_the_frame_and_where_the_map_is_unknown_is_lit() -> None:
     warp[0, 1] = (99, 2)
     warp[0, 2] = (np.inf, 2)
     warp[0, 3] = (2, -1e9)
-    assert resample(image, warp, 1.0)[0].tolist() == [1, 1, 1, 1, 0]
+    assert sample(image, positions(warp), 1.0)[0].tolist() == [1, 1, 1, 1, 0]
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 def test_resampling_keeps_channels_and_edge(channels: int) -> None:
     image = np.zeros((5, 5, channels), np.float32)
-    result = resample(image, identity_map(5, 5) + 50, 1.0)
+    result = sample(image, positions(identity_map(5, 5) + 50), 1.0)
     assert result.shape == (5, 5, channels)
     assert (result == 1).all()

@@ -18,6 +18,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from shadowtool.core.half_floats import to_half
 from shadowtool.core.transfer import TRANSFERS
 from shadowtool.errors import DamagedFileError, InputError, RetryError
 from shadowtool.io.files import fingerprint
@@ -30,7 +31,6 @@ from shadowtool.io.image import (
     read_image,
     resolve_transfer,
     to_code,
-    to_half,
     write_exr,
     write_png,
 )

@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from shadowtool.core.half_floats import to_half
 from shadowtool.core.warp_map import identity_map
 from shadowtool.errors import OptionError, ReshootError
-from shadowtool.io.image import Header, to_half, write_exr, write_png
+from shadowtool.io.image import Header, write_exr, write_png
 from shadowtool.io.products import WARP, read_scan, read_warp, write_scan
 from shadowtool.steps.run import Run
 from shadowtool.steps.scan import scan

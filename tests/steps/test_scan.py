@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shadowtool.io.image import to_half
+from shadowtool.core.half_floats import to_half
 from shadowtool.io.products import read_scan
 from shadowtool.steps.scan import scan
 from tests.conftest import write_frames

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from shadowtool.core.half_floats import to_half
 from shadowtool.errors import ReshootError
-from shadowtool.io.image import Header, to_half, write_exr
+from shadowtool.io.image import Header, write_exr
 from shadowtool.io.products import read_scan, write_scan
 from shadowtool.steps.run import Run
 from shadowtool.steps.scan import scan

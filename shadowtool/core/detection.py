@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.backdrop import Backdrop, Nearest, Places
-from shadowtool.core.bands import channel_sum
+from shadowtool.core.bands import bands, channel_sum
 from shadowtool.core.filling import fill_membrane
 from shadowtool.core.regions import grown, large_parts, opened, parts_with, shrunk, square
 from shadowtool.core.trimap import BACKGROUND, FIGURE
@@ -152,10 +152,15 @@ def _with_leaks(image: Float32, backdrop: Backdrop, nearest: Nearest) -> Float32
     ground, beta = nearest.distance2 < _OFF_LINE2, np.clip(nearest.beta, 0, 1)
     most = cv2.dilate(np.where(ground, beta, np.float32(0)), square(_LEAKS))
     least = cv2.erode(np.where(ground, beta, np.float32(1)), square(_LEAKS))
-    step = np.float32(_LEAKING) * np.maximum(most - least, 0)
-    leak = step[..., np.newaxis] * (backdrop.lit - backdrop.shadow)
-    more = channel_sum(leak * leak / backdrop.variance(image)) / 3
-    return np.asarray(nearest.distance2 / (1 + more), np.float32)
+    step = np.subtract(most, least, out=most)
+    step *= np.float32(_LEAKING)
+    distance2 = np.empty_like(nearest.distance2)
+    for rows in bands(image.shape):
+        here = backdrop.at((rows, slice(None)))
+        leak = np.maximum(step[rows], 0)[..., np.newaxis] * (here.lit - here.shadow)
+        more = channel_sum(leak * leak / here.variance(image[rows])) / 3
+        distance2[rows] = nearest.distance2[rows] / (1 + more)
+    return distance2
 
 
 def _certain_parts(mask: Bool, distance2: Float32, other: Float32) -> Bool:
@@ -167,10 +172,11 @@ def _certain_parts(mask: Bool, distance2: Float32, other: Float32) -> Bool:
         other: (H, W), evidence besides the distance.
     """
     count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8)
-    size, sure, told = (
-        np.bincount(labels.ravel(), values.ravel(), count)
-        for values in (mask, distance2 > _OFF_LINE2, other)
+    own = labels[mask]
+    size, sure = (
+        np.bincount(some, minlength=count) for some in (own, own[distance2[mask] > _OFF_LINE2])
     )
+    told = np.bincount(own, other[mask], count)
     kept = (sure >= _CERTAIN * size) | (told > _TOLD * size)
     kept[0] = False
     return np.asarray(kept[labels])

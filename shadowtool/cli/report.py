@@ -50,17 +50,15 @@ def _headline(row: dict[str, Any]) -> str:
 
 
 def _text(value: Any) -> str:
+    from shadowtool.io.sequence import frame_number
+
     if isinstance(value, dict):
-        if len(value) > _MANY and all(map(_is_number, value)):
+        if len(value) > _MANY and all(frame_number(name) is not None for name in value):
             return f"{len(value)} frames, {_range(value.values())}"
         return ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in value.items()) or "none"
     if isinstance(value, list):
         return ", ".join(map(_text, value)) or "none"
     return "none" if value is None else str(value)
-
-
-def _is_number(name: str) -> bool:
-    return name.removeprefix("-").replace(".", "", 1).isdigit()
 
 
 def _range(values: Iterable[Any]) -> str:

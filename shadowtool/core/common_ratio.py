@@ -111,7 +111,7 @@ class _Frequent(NamedTuple):
 
 
 def common_ratio(
-    stack: Float32, ascending: Index, noise: NoiseModel, size: tuple[int, int]
+    stack: Float32, bright: Float32, ascending: Index, noise: NoiseModel, size: tuple[int, int]
 ) -> Float32 | None:
     """S/L of each point, (3, N), as the scene's shadows have it in common around; None if none is
     much more frequent than others.
@@ -119,9 +119,14 @@ def common_ratio(
     Of a shadow that is all but black noise leaves no ratio, but then more samples are black than
     have any one. Where a lamp is near, its shadow is deeper than elsewhere: a window of the grid
     has a ratio of its own if that certainly has the ground's texture.
+
+    Args:
+        stack: (T, 3, N), samples of the take on the grid, linear light, finite.
+        bright: (3, N), of `usually_bright`.
+        ascending: (T, N), each point's samples from dark to bright.
+        size: the grid's rows and columns.
     """
     total = stack.sum(axis=1)
-    bright = _usually_bright(stack, total, ascending)
     light = bright.sum(axis=0)
     clear = light > _CLEAR * noise.sigma(bright.T).sum(axis=1)
     part = total / np.where(clear, light, 1)
@@ -142,7 +147,7 @@ def common_ratio(
 
 
 def ratio_scatter(
-    stack: Float32, ascending: Index, noise: NoiseModel, ratio: Float32, size: tuple[int, int]
+    stack: Float32, bright: Float32, noise: NoiseModel, ratio: Float32, size: tuple[int, int]
 ) -> float:
     """How far S/L differs from point to point, a standard deviation of its logarithm besides the
     noise; 0 where too few samples tell.
@@ -152,10 +157,9 @@ def ratio_scatter(
     across the picture.
 
     Args:
-        stack, ascending, noise, size: as of `common_ratio`.
+        stack, bright, noise, size: as of `common_ratio`.
         ratio: (3, N), what that found.
     """
-    bright = _usually_bright(stack, stack.sum(axis=1), ascending)
     shade = np.maximum(bright * ratio, np.float32(1e-4))
     noisy = np.hypot(noise.sigma(shade.T).T / shade, noise.sigma(bright.T).T / bright.clip(1e-4))
     off = np.log(np.maximum(stack[::_SOME_SAMPLES], np.float32(1e-4)) / shade)
@@ -302,9 +306,10 @@ def _without_lit(counts: NDArray[np.integer], zero: int) -> NDArray[np.integer]:
     return rest
 
 
-def _usually_bright(stack: Float32, total: Float32, ascending: Index) -> Float32:
-    """Of a pixel's samples that may be lit the one that most others are next to, (3, N): somebody
-    bright is not there for long."""
+def usually_bright(stack: Float32, ascending: Index) -> Float32:
+    """Of a point's samples that may be lit the one that most others are next to, (3, N): somebody
+    bright is not there for long. Arguments as for `common_ratio`."""
+    total = stack.sum(axis=1)
     found = np.zeros(stack.shape[1:], np.float32)
     most = np.full(stack.shape[2], -1)
     for part in _BRIGHT_RANKS[: None if len(stack) >= _ENOUGH else 1]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import blocks
 from shadowtool.core.color_line import Weighed, channels, line_distance
-from shadowtool.core.common_ratio import common_ratio, ratio_scatter
+from shadowtool.core.common_ratio import common_ratio, ratio_scatter, usually_bright
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.regions import large_parts
 from shadowtool.core.samples import mean_where, ranked
@@ -96,7 +96,8 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     stack = np.nan_to_num(stack, copy=False, nan=0.0, posinf=1e4, neginf=0.0)
     weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
     ascending = np.argsort(stack.sum(axis=1), axis=0)
-    common = common_ratio(stack, ascending, noise, shape[:2])
+    bright = usually_bright(stack, ascending)
+    common = common_ratio(stack, bright, ascending, noise, shape[:2])
     ratio = np.full(stack.shape[1:], _ANY_RATIO, np.float32) if common is None else common
     lit = np.empty_like(ratio)
     for part in blocks(lit.shape[1], _BLOCK):
@@ -108,7 +109,7 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     shadow = lit * ratio
     under_card = _under_a_card(stack, on_line, lit)
     shadow = _deeper_shade(stack, on_line, lit, shadow, shape[:2])
-    scatter = 0.0 if common is None else ratio_scatter(stack, ascending, noise, ratio, shape[:2])
+    scatter = 0.0 if common is None else ratio_scatter(stack, bright, noise, ratio, shape[:2])
     if scatter > _EVEN:
         shadow *= np.float32(math.exp(-_DARKER * scatter))
     tolerance = _TOLERANCE + min(_ROUGHNESS * scatter, _ROUGHEST)

@@ -69,7 +69,8 @@ def _turned_round(warp_map: WarpMap, rows: slice) -> _Points:
     """What the triangles below some rows of pixels show."""
     height, width = warp_map.error.shape
     part = slice(rows.start, rows.stop + 1)
-    place = identity_map(height, width)[part].reshape(-1, 2).astype(np.float64)
+    place = identity_map(part.stop - part.start, width).reshape(-1, 2).astype(np.float64)
+    place[:, 1] += part.start
     shown = warp_map.warp[part].reshape(-1, 2).astype(np.float64)
     error = warp_map.error[part].ravel().astype(np.float64)
     corners = _triangles(part.stop - part.start, width)

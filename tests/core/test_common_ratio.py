@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shadowtool.core.common_ratio import common_ratio, ratio_scatter
+from shadowtool.core.common_ratio import common_ratio, ratio_scatter, usually_bright
 from shadowtool.core.noise import NoiseModel
 
 SIZE = (90, 160)
@@ -28,8 +28,14 @@ def samples(scatter: float, gradient: float = 0.0) -> np.ndarray:
     return np.stack(taken).astype(np.float32)
 
 
+def brightest(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What points usually are in light, and the order of their samples."""
+    ascending = np.argsort(stack.sum(axis=1), axis=0)
+    return usually_bright(stack, ascending), ascending
+
+
 def ratio_of(stack: np.ndarray) -> np.ndarray:
-    found = common_ratio(stack, np.argsort(stack.sum(axis=1), axis=0), NOISE, SIZE)
+    found = common_ratio(stack, *brightest(stack), NOISE, SIZE)
     assert found is not None
     return found
 
@@ -45,20 +51,17 @@ def test_scatter_is_told_from_a_ratio_that_changes_across_the_picture(
     scatter: float, gradient: float
 ) -> None:
     stack = samples(scatter, gradient)
-    ascending = np.argsort(stack.sum(axis=1), axis=0)
-    found = ratio_scatter(stack, ascending, NOISE, ratio_of(stack), SIZE)
+    found = ratio_scatter(stack, brightest(stack)[0], NOISE, ratio_of(stack), SIZE)
     assert found == pytest.approx(scatter, rel=0.25)
 
 
 def test_noise_is_no_scatter() -> None:
     stack = samples(0.0)
-    ascending = np.argsort(stack.sum(axis=1), axis=0)
-    assert ratio_scatter(stack, ascending, NOISE, ratio_of(stack), SIZE) < 0.01
+    assert ratio_scatter(stack, brightest(stack)[0], NOISE, ratio_of(stack), SIZE) < 0.01
 
 
 def test_where_nothing_is_in_shade_nothing_scatters() -> None:
     stack = np.repeat(samples(0.1)[:1], 12, axis=0)
     stack += np.random.default_rng(0).normal(0, SIGMA, stack.shape).astype(np.float32)
-    ascending = np.argsort(stack.sum(axis=1), axis=0)
     ratio = np.full(stack.shape[1:], 0.25, np.float32)
-    assert ratio_scatter(stack, ascending, NOISE, ratio, SIZE) == 0
+    assert ratio_scatter(stack, brightest(stack)[0], NOISE, ratio, SIZE) == 0

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 # Values in a band: an array of as many single floats is 1.5 MB. Smaller ones fit the cache better,
 # but threads that work through many bands wait for one another at each.
 _VALUES = 3 << 17
+# Rows that are worked through with those around them, at least, and times as many as these are;
+# always a multiple of this, by which others count in cells.
+_ROWS, _REACHES, _WHOLE = 192, 4, 16
 _ONES = np.ones((1, 3), np.float32)
 
 
@@ -30,15 +33,21 @@ def blocks(count: int, together: int) -> Iterator[slice]:
         yield slice(start, min(start + together, count))
 
 
-def overlapping_bands(height: int, reach: int, rows: int = 192) -> list[tuple[slice, slice]]:
+def overlapping_bands(
+    height: int, reach: int, rows: int | None = None
+) -> list[tuple[slice, slice]]:
     """Rows of a picture of which each result depends on others around it.
 
     Args:
         reach: how far, pixels.
+        rows: of a band; None for so many that little is read twice, and all bands are alike.
 
     Returns:
         For each band the rows that are to be read, and where in these its own rows lie.
     """
+    if rows is None:
+        count = max(height // max(_ROWS, _REACHES * reach), 1)
+        rows = -(-max(height, 1) // (count * _WHOLE)) * _WHOLE
     cut = []
     for first in range(0, height, rows):
         last = min(first + rows, height)

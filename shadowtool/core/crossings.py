@@ -231,22 +231,25 @@ class CrossingFinder:
             # in the light, so the threshold's is no less than the mean of theirs.
             darker &= state.after >= (low >> 1) + (high >> 1)
         pixels = np.flatnonzero(darker)
-        lit, threshold = _value(high[pixels]), _midway(low[pixels], high[pixels])
+        lit, dark = _value(high.take(pixels)), low.take(pixels)
+        threshold = to_keys(rounded((_value(dark) + lit) / np.float32(2)))
         # What is nearly as bright as it ever was crosses no threshold that matters in the end.
         nearly_lit = to_keys(rounded(_NEARLY_LIT * lit))
-        crossed = (low[pixels] < nearly_lit) & (state.after[pixels] >= threshold)
-        pixels, threshold, nearly_lit = pixels[crossed], threshold[crossed], nearly_lit[crossed]
-        fresh = state.low[pixels] >= np.minimum(threshold, nearly_lit)
+        crossed = np.flatnonzero((dark < nearly_lit) & (state.after.take(pixels) >= threshold))
+        pixels, threshold = pixels.take(crossed), threshold.take(crossed)
+        nearly_lit = nearly_lit.take(crossed)
+        before = state.low.take(pixels)
+        fresh = before >= np.minimum(threshold, nearly_lit)
         begun, old = pixels[fresh], pixels[~fresh]
         number = self._frames - len(new)
         # Darker by noise long before, and an edge that takes several frames to pass: where it
         # begins can't be told.
-        aged = state.low[begun] < nearly_lit[fresh]
-        aged &= number - state.at[begun] > len(seen) - 1
-        doubtful = aged | state.lost[begun]
+        aged = before[fresh] < nearly_lit[fresh]
+        aged &= number - state.at.take(begun) > len(seen) - 1
+        doubtful = aged | state.lost.take(begun)
         _creep(state, high, begun[doubtful], aged[doubtful], new)
         # As if they had crossed in the frame before.
-        last = np.full(len(begun), number - 1), seen[-1][begun], state.lower[begun]
+        last = np.full(len(begun), number - 1), seen[-1].take(begun), state.lower.take(begun)
         _search(state, begun, threshold[fresh], last, [*seen[-2:], *new], number - 2)
         number -= len(seen)
         floor = np.minimum(state.floor[old], state.before[old])
@@ -311,10 +314,10 @@ def _creep(
     Args:
         aged: (P,), whose crossing found last is too long ago to look up what came after it.
     """
-    low, lit, after = state.low[pixels], high[pixels], state.after[pixels]
-    lost, passed = state.lost[pixels], np.zeros(len(pixels), bool)
+    low, lit, after = state.low.take(pixels), high.take(pixels), state.after.take(pixels)
+    lost, passed = state.lost.take(pixels), np.zeros(len(pixels), bool)
     for frame in frames:
-        values = frame[pixels]
+        values = frame.take(pixels)
         threshold = _midway(values, lit)
         darker = values < low
         falls = darker & (low >= threshold)
@@ -347,25 +350,29 @@ def _search(
     old, after, floor = last[0] - first, *last[1:]
     start = max(int(old.min()) - 1, 0)
     old, first, frames = old - start, first + start, frames[start:]
-    values = np.empty((len(frames), count), np.int16)
-    for own, frame in zip(values, frames, strict=True):
-        # Without "clip" numpy buffers the result, lest an index be out of bounds.
-        np.take(frame, pixels, out=own, mode="clip")
+    values, lowest = (np.empty((len(frames), count), np.int16) for _ in range(2))
+    for row, frame in enumerate(frames):
+        values[row] = frame.take(pixels)
     # The lowest since the old crossing, which itself is not among them.
-    lowest = values.copy()
-    for row in range(min(int(old.max()) + 1, len(frames))):
-        lowest[row][row <= old] = _UNKNOWN
+    so_far, latest = np.full(count, _UNKNOWN), int(old.max())
     found = np.full(count, 2, np.uint8)
-    for row in range(1, len(frames)):
-        np.minimum(lowest[row], lowest[row - 1], out=lowest[row])
+    for row, own in enumerate(values):
+        since = np.where(row <= old, _UNKNOWN, own) if row <= latest else own
+        so_far = np.minimum(since, so_far, out=lowest[row])
         if row >= 2:
-            found += (lowest[row] >= threshold).view(np.uint8)
-    place = found * np.intp(count) + np.arange(count)
-    np.minimum(floor, after, out=floor, where=found - 2 >= old)
-    state.floor[pixels] = np.minimum(floor, lowest.ravel()[place - 2 * count])
+            found += (so_far >= threshold).view(np.uint8)
+    place = found * np.intp(count)
+    place += np.arange(count)
     state.at[pixels] = first + found.astype(np.int32)
-    for part, ago in ((state.after, 0), (state.before, 1), (state.earlier, 2)):
-        part[pixels] = values.ravel()[place - ago * count]
+    every = values.ravel()
+    state.after[pixels] = every.take(place)
+    place -= count
+    state.before[pixels] = every.take(place)
+    place -= count
+    state.earlier[pixels] = every.take(place)
+    passed = found - 2 >= old
+    floor = np.where(passed, np.minimum(floor, after), floor)
+    state.floor[pixels] = np.minimum(floor, lowest.ravel().take(place))
 
 
 def _value(keys: Int16) -> Float32:

@@ -21,6 +21,7 @@ Float64 = NDArray[np.float64]
 Floats = NDArray[np.floating]
 Bool = NDArray[np.bool_]
 Powers = Sequence[tuple[int, int]]
+Moments = dict[tuple[int, int], Floats]
 
 # Half the windows' widths, pixels, for edges that move up to so many pixels a frame; and the
 # largest for any. Where a step is longer than usual, the largest must still reach over it.
@@ -95,17 +96,19 @@ def fit_planes(
         Value and predicted error, (H, W) float32 each, of the rows wanted; NaN and infinite where
         the value was unknown. A lone measurement that no neighbour agrees with is replaced.
     """
-    known = np.isfinite(value) & np.isfinite(error)
-    variance = np.where(known, error, 1).astype(np.float64) ** 2
-    trusted = _trusted(value, error, windows.near)
-    measured = np.where(known, value, 0).astype(np.float64)
-    weight = np.where(trusted, 1 / np.maximum(variance, 1e-12), 0)
+    known, variance = _known(value, error)
+    trusted = _trusted(value, known, variance, windows.near)
+    measured, weight = (np.empty(value.shape) for _ in range(2))
+    for rows in bands(value.shape):
+        measured[rows] = np.where(known[rows], value[rows], np.float32(0))
+        weight[rows] = trusted[rows] / np.maximum(variance[rows], np.float32(1e-12))
     first, last, _ = wanted.indices(len(value))
     known, trusted, variance = known[wanted], trusted[wanted], variance[wanted]
     best = measured[wanted].astype(np.float32)
-    spread = np.where(trusted, variance, np.inf).astype(np.float32)
+    spread = np.where(trusted, variance, np.float32(np.inf))
     # A plane may deviate from the measurement by so much.
-    allowed = np.where(trusted, _AGREES * np.sqrt(variance), np.inf).astype(np.float32)
+    allowed = np.sqrt(spread)
+    allowed *= np.float32(_AGREES)
     least, most = best - allowed, best + allowed
     for radius in windows.radii:
         size, cells = _cells(radius)
@@ -113,20 +116,41 @@ def fit_planes(
         start = max(first // size - 2 * cells, 0) * size
         stop = (-(-last // size) + 2 * cells) * size
         planes = _planes(measured[start:stop], weight[start:stop], size, cells, windows.factor)
-        for rows in bands(best.shape, channels=_ARRAYS):
+        for rows in bands(best.shape, channels=_ARRAYS // 2):
             chosen = _Choice(*(part[rows] for part in (best, spread, least, most)))
-            _choose(planes, size * cells, rows.start + first - start, chosen)
+            _choose(planes, rows.start + first - start, chosen)
     found = known & np.isfinite(spread)
     best[~found] = np.nan
     spread[~found] = np.inf
     return best, np.sqrt(spread, out=spread)
 
 
-def _trusted(value: Float32, error: Float32, near: float) -> Bool:
-    """Which measurements are known, and agree with others around them."""
-    known = np.isfinite(value) & np.isfinite(error)
-    variance = np.where(known, error, 1).astype(np.float32) ** 2
-    return known & _in_company(np.where(known, value, np.float32(np.nan)), variance, near)
+def _known(value: Float32, error: Float32) -> tuple[Bool, Float32]:
+    """Which measurements are known, and their variances; 1 where they are not."""
+    known = np.isfinite(value)
+    known &= np.isfinite(error)
+    variance = np.where(known, error, np.float32(1))
+    return known, np.square(variance, out=variance)
+
+
+def _trusted(value: Float32, known: Bool, variance: Float32, near: float) -> Bool:
+    """Which of the known measurements agree with enough of the eight around them."""
+    value = np.where(known, value, np.float32(np.nan))
+    allowed = variance * np.float32(_AGREES**2)
+    company = np.zeros(value.shape, np.uint8)
+    # The other four directions are these from the other pixel's point of view.
+    for rows in bands(value.shape):
+        for dy, dx in ((0, 1), (1, -1), (1, 0), (1, 1)):
+            here, there = _overlap(value.shape, dy, dx, rows)
+            here = (slice(here[0].start + rows.start, here[0].stop + rows.start), here[1])
+            apart = np.abs(value[here] - value[there])
+            apart -= np.float32(near)
+            np.maximum(apart, 0, out=apart)
+            # NaN agrees with none.
+            agrees = np.square(apart, out=apart) <= allowed[here] + allowed[there]
+            company[here] += agrees
+            company[there] += agrees
+    return company >= _COMPANY
 
 
 def understated(value: Float32, error: Float32, plane: Bool, windows: Windows = Windows()) -> float:
@@ -166,7 +190,9 @@ def understated(value: Float32, error: Float32, plane: Bool, windows: Windows = 
     values, errors = np.where(outside, np.float32(np.nan), value[within]), error[within]
     # One below the other: only their margins meet.
     tall = (-1, values.shape[2])
-    trusted = _trusted(values.reshape(tall), errors.reshape(tall), windows.near)
+    trusted = _trusted(
+        values.reshape(tall), *_known(values.reshape(tall), errors.reshape(tall)), windows.near
+    )
     used = trusted.reshape(values.shape)[:, 1:-1, 1:-1].reshape(len(values), -1)
     values, errors = (
         part[:, 1:-1, 1:-1].reshape(len(part), -1).astype(np.float64) for part in (values, errors)
@@ -184,21 +210,6 @@ def understated(value: Float32, error: Float32, plane: Bool, windows: Windows = 
     return float(np.sqrt(max(np.quantile(misfit, 0.75) / _USUAL_MISFIT, 1))) if misfit.size else 1.0
 
 
-def _in_company(value: Float32, variance: Float32, near: float) -> Bool:
-    """Where enough of the eight pixels around agree with a measurement; NaN agrees with none."""
-    company = np.zeros(value.shape, np.uint8)
-    # The other four directions are these from the other pixel's point of view.
-    for dy, dx in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        here, there = _overlap(value.shape, dy, dx)
-        allowed = np.sqrt(variance[here] + variance[there])
-        allowed *= np.float32(_AGREES)
-        allowed += np.float32(near)
-        agrees = np.abs(value[here] - value[there]) < allowed
-        company[here] += agrees
-        company[there] += agrees
-    return company >= _COMPANY
-
-
 def _cells(radius: int) -> tuple[int, int]:
     """The cells that windows of a radius are made of: their size in pixels, and how many lie on
     either side of the middle one."""
@@ -207,9 +218,12 @@ def _cells(radius: int) -> tuple[int, int]:
 
 
 class _Planes(NamedTuple):
-    """The planes a + bx + cy fitted to the windows around the pixels, x and y counted from the
-    middle in radii; the variance at (x, y) is aa + x·ab + y·ac + x²·bb + xy·bc + y²·cc, infinite
-    where the window holds more than one surface. (H, W) float32 each."""
+    """The planes a + bx + cy fitted to the windows around cells, x and y counted in radii; the
+    variance at (x, y) is aa + x·ab + y·ac + x²·bb + xy·bc + y²·cc, infinite where the window holds
+    more than one surface. (rows of cells, W) float32 each.
+
+    They stand for each column of pixels, x counted from it, and y from the middle of the cells.
+    """
 
     a: Float32
     b: Float32
@@ -221,34 +235,50 @@ class _Planes(NamedTuple):
     bc: Float32
     cc: Float32
 
-    def at(self, pixels: tuple[slice, slice], x: int, y: int) -> tuple[Float32, Float32]:
-        """Value and variance at (x, y), each of which is -1, 0 or 1, of the windows at pixels."""
-        a, b, c, aa, ab, ac, bb, bc, cc = (part[pixels] for part in self)
-        value, variance = a.copy(), aa.copy()
-        for side, slope, linear, square in ((x, b, ab, bb), (y, c, ac, cc)):
-            if side:
-                _added(value, slope, side)
-                _added(variance, linear, side)
-                variance += square
-        if x and y:
-            _added(variance, bc, x * y)
-        return value, variance
-
     def from_column(self, x: Float32) -> "_Planes":
         """The same counted from (x, 0)."""
         a, b, c, aa, ab, ac, bb, bc, cc = self
         a, aa = a + x * b, aa + x * (ab + x * bb)
         return _Planes(a, b, c, aa, ab + 2 * x * bb, ac + x * bc, bb, bc, cc)
 
-    def from_row(self, y: Float32) -> "_Planes":
-        """The same counted from (0, y)."""
-        a, b, c, aa, ab, ac, bb, bc, cc = self
-        a, aa = a + y * c, aa + y * (ac + y * cc)
-        return _Planes(a, b, c, aa, ab + y * bc, ac + 2 * y * cc, bb, bc, cc)
+    def along(self, rows: slice, y: Float32) -> "_Lines":
+        """What they are at several y, (N, 1), for some rows."""
+        a, b, c, aa, ab, ac, bb, bc, cc = (part[rows, np.newaxis] for part in self)
+        return _Lines(a + y * c, b, aa + y * (ac + y * cc), ab + y * bc, bb)
 
 
-def _added(total: Float32, part: Float32, sign: int) -> None:
-    (np.add if sign > 0 else np.subtract)(total, part, out=total)
+class _Lines(NamedTuple):
+    """Planes at one y each: a + bx, with the variance aa + x·ab + x²·bb; (rows of cells, N, W)."""
+
+    a: Float32
+    b: Float32
+    aa: Float32
+    ab: Float32
+    bb: Float32
+
+    def at(self, x: int, columns: slice) -> tuple[Float32, Float32]:
+        """Value and variance at x, which is -1, 0 or 1, of some columns; (rows, columns)."""
+        a, b, aa, ab, bb = (part[..., columns] for part in self)
+        if x:
+            combine = np.add if x > 0 else np.subtract
+            a, aa = combine(a, b), combine(aa, ab)
+            aa += bb
+        shape = a.shape[0] * a.shape[1], a.shape[2]
+        return a.reshape(shape), aa.reshape(shape)
+
+
+class _Fitted(NamedTuple):
+    """Planes, and the windows that they were fitted to.
+
+    Attributes:
+        height: of the picture that was fitted.
+        size, cells: what windows are made of, as of `_cells`.
+    """
+
+    planes: _Planes
+    height: int
+    size: int
+    cells: int
 
 
 class _Choice(NamedTuple):
@@ -261,32 +291,42 @@ class _Choice(NamedTuple):
     most: Float32
 
 
-def _choose(planes: _Planes, radius: int, first: int, chosen: _Choice) -> None:
+def _choose(fitted: _Fitted, first: int, chosen: _Choice) -> None:
     """Replace what was chosen by the best known of the windows that hold a pixel.
 
     Args:
-        first: the row among the planes that is the first of the choice.
+        first: the row among those fitted that is the first of the choice.
     """
-    best, spread, least, most = chosen
-    rows = slice(first, first + len(best))
     # And with what smaller windows told.
-    allowed = np.sqrt(spread)
+    allowed = np.sqrt(chosen.variance)
     allowed *= np.float32(_AGREES)
-    least, most = np.maximum(least, best - allowed), np.minimum(most, best + allowed)
-    for row, column in np.ndindex(3, 3):
-        y, x = row - 1, column - 1
-        # The window's centre lies (x, y) ahead, so the pixel lies (-x, -y) off it.
-        here, there = _overlap(planes.a.shape, y * radius, x * radius, rows)
-        value, variance = planes.at(there, -x, -y)
-        better = variance < spread[here]
-        better &= value >= least[here]
-        better &= value <= most[here]
-        # Many times faster than numpy's own where it goes now one way, now the other.
-        cv2.copyTo(value, better.view(np.uint8), best[here])
-        cv2.copyTo(variance, better.view(np.uint8), spread[here])
+    least = np.maximum(chosen.least, chosen.value - allowed)
+    most = np.minimum(chosen.most, chosen.value + allowed)
+    best, spread, _, _ = chosen
+    planes, height, size, cells = fitted
+    radius = size * cells
+    shape, rows = (height, best.shape[1]), slice(first, first + len(best))
+    # From the middle of a cell, in radii, as planes are.
+    offsets = (np.arange(size, dtype=np.float32)[:, np.newaxis] - (size - 1) / 2) / radius
+    for dy in (-1, 0, 1):
+        # The window's centre lies (dx, dy) ahead, so the pixel lies (-dx, -dy) off it.
+        (own, _), (there, _) = _overlap(shape, dy * radius, 0, rows)
+        whole = slice(there.start // size, -(-there.stop // size))
+        inner = slice(there.start - whole.start * size, there.stop - whole.start * size)
+        lines = planes.along(whole, np.asarray(offsets - dy, np.float32))
+        for dx in (-1, 0, 1):
+            (_, columns), (_, ahead) = _overlap(shape, 0, dx * radius, rows)
+            value, variance = (part[inner] for part in lines.at(-dx, ahead))
+            here = own, columns
+            better = variance < spread[here]
+            better &= value >= least[here]
+            better &= value <= most[here]
+            # Many times faster than numpy's own where it goes now one way, now the other.
+            cv2.copyTo(value, better.view(np.uint8), best[here])
+            cv2.copyTo(variance, better.view(np.uint8), spread[here])
 
 
-def _planes(value: Float64, weight: Float64, size: int, cells: int, factor: float) -> _Planes:
+def _planes(value: Float64, weight: Float64, size: int, cells: int, factor: float) -> _Fitted:
     """The planes fitted to the windows around all pixels.
 
     Args:
@@ -294,82 +334,109 @@ def _planes(value: Float64, weight: Float64, size: int, cells: int, factor: floa
             same.
         factor: by how much planes are known worse than from independent measurements.
     """
+    height, width = value.shape
+    sums = _window_sums(value, weight, size, cells)
+    planes = _Planes(*(np.empty(sums[0].shape, np.float32) for _ in range(9)))
+    for rows in bands(sums[0].shape, channels=_ARRAYS):
+        _solve([part[rows] for part in sums], factor, size * cells, rows, planes)
+    if size > 1:
+        # The pixels' columns from the middle of their cells, in radii, as the planes are.
+        offsets = ((np.arange(width) % size - (size - 1) / 2) / (size * cells)).astype(np.float32)
+        wide = (sums[0].shape[1] * size, sums[0].shape[0])
+        parts = (cv2.resize(part, wide, interpolation=cv2.INTER_NEAREST) for part in planes)
+        columns = (np.asarray(part[:, :width], np.float32) for part in parts)
+        planes = _Planes(*columns).from_column(offsets)
+    return _Fitted(planes, height, size, cells)
+
+
+def _images(value: Float64, weight: Float64) -> list[tuple[Floats, Powers]]:
+    """What is summed up over windows, and times which powers (a, b) of the place, xᵃyᵇ."""
     weighted = weight * value
     used = (weight > 0).astype(np.float32)
-    sums = [
-        *_window_sums(weight, size, cells, ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))),
-        *_window_sums(weighted, size, cells, ((0, 0), (1, 0), (0, 1))),
-        *_window_sums(weighted * value, size, cells, ((0, 0),)),
-        *_window_sums(used, size, cells, ((0, 0),)),
+    return [
+        (weight, ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))),
+        (weighted, ((0, 0), (1, 0), (0, 1))),
+        (weighted * value, ((0, 0),)),
+        (used, ((0, 0),)),
     ]
-    found = _Planes(*(np.empty(sums[0].shape, np.float32) for _ in range(9)))
-    for rows in bands(sums[0].shape, channels=_ARRAYS):
-        _solve([part[rows] for part in sums], factor, size * cells, rows, found)
-    return found if size == 1 else _for_pixels(found, value.shape, size, cells)
 
 
-def _for_pixels(found: _Planes, shape: tuple[int, ...], size: int, cells: int) -> _Planes:
-    """The same planes for each of the cells' pixels, counted as if it were the cell's middle."""
-    height, width = found.a.shape
-    # In radii, as the planes are.
-    offsets = ((np.arange(size) - (size - 1) / 2) / (size * cells)).astype(np.float32)
-    wide = (width * size, height)
-    parts = (cv2.resize(part, wide, interpolation=cv2.INTER_NEAREST) for part in found)
-    moved = _Planes(*(np.asarray(part, np.float32) for part in parts)).from_column(
-        np.tile(offsets, width)
-    )
-    planes = _Planes(*(np.empty((height, size, width * size), np.float32) for _ in found))
-    for row in range(size):
-        for part, own in zip(planes, moved.from_row(offsets[row : row + 1]), strict=True):
-            part[:, row] = own
-    own_rows, own_columns = map(slice, shape)
-    return _Planes(*(part.reshape(height * size, -1)[own_rows, own_columns] for part in planes))
-
-
-def _window_sums(image: Floats, size: int, cells: int, powers: Powers) -> list[Floats]:
-    """Sums of the image times xᵃyᵇ over the windows around all cells, x and y counted from there
-    in pixels."""
+def _window_sums(value: Float64, weight: Float64, size: int, cells: int) -> list[Floats]:
+    """Sums of the `_images` over the windows around all cells, x and y counted from there in
+    pixels."""
     border = cv2.BORDER_CONSTANT
     if size == 1:
         ramp = np.arange(-cells, cells + 1, dtype=np.float64)
         kernels = [ramp**power for power in range(3)]
         return [
             np.asarray(cv2.sepFilter2D(image, -1, kernels[a], kernels[b], borderType=border))
+            for image, powers in _images(value, weight)
             for a, b in powers
         ]
-    moments = _moments(image, size, powers)
-    height, width = moments[0, 0].shape
-    # All about the picture's middle, to be summed up, and then each about its own window's.
+    height, width = (-(-length // size) for length in value.shape)
+    # From the picture's middle, to be summed up, and then each from its own window's.
     x = size * (np.arange(width) - width / 2)
     y = size * (np.arange(height) - height / 2)[:, np.newaxis]
-    _count_from(moments, -x, -y)
     window = (2 * cells + 1, 2 * cells + 1)
-    for power, own in moments.items():
-        total = cv2.boxFilter(own, -1, window, normalize=False, borderType=border)
-        moments[power] = np.asarray(total, np.float64)
-    _count_from(moments, x, y)
-    return [moments[power] for power in powers]
+    sums = list[Floats]()
+    for moments in _moments(value, weight, size):
+        _count_from(moments, -x, -y)
+        for power, own in moments.items():
+            total = cv2.boxFilter(own, -1, window, normalize=False, borderType=border)
+            moments[power] = np.asarray(total, np.float64)
+        _count_from(moments, x, y)
+        sums += moments.values()
+    return sums
 
 
-def _moments(image: Floats, size: int, powers: Powers) -> dict[tuple[int, int], Float64]:
-    """Sums of the image times xᵃyᵇ over each cell, x and y counted from its middle in pixels."""
-    height, width = (-(-length // size) for length in image.shape)
-    if (height * size, width * size) != image.shape:
-        rest = [(0, n * size - own) for n, own in zip((height, width), image.shape, strict=True)]
+def _moments(value: Float64, weight: Float64, size: int) -> list[Moments]:
+    """Sums of the `_images` over each cell, x and y counted from its middle in pixels."""
+    height, width = (-(-length // size) for length in value.shape)
+    sums: list[Moments] = []
+    for rows in bands((height, size * value.shape[1])):
+        taken = slice(size * rows.start, size * rows.stop)
+        for place, (image, powers) in enumerate(_images(value[taken], weight[taken])):
+            if place == len(sums):
+                sums.append({power: np.empty((height, width)) for power in powers})
+            for power, own in _cell_sums(image, size, powers).items():
+                sums[place][power][rows] = own
+    return sums
+
+
+def _cell_sums(image: Floats, size: int, powers: Powers) -> Moments:
+    """`_moments` of one image; cells that its edge cuts off go on with 0."""
+    rest = [(0, -length % size) for length in image.shape]
+    if rest != [(0, 0), (0, 0)]:
         image = np.pad(image, rest)
-    offsets = np.arange(size) - (size - 1) / 2
-    across = [np.zeros((height * size, width)) for _ in range(1 + max(a for a, _ in powers))]
-    for column, x in enumerate(offsets):
-        for a, total in enumerate(across):
-            total += x**a * image[:, column::size]
-    moments = {power: np.zeros((height, width)) for power in powers}
-    for row, y in enumerate(offsets):
-        for (a, b), total in moments.items():
-            total += y**b * across[a][row::size]
-    return moments
+    half = size // 2
+    offsets = np.arange(half) + 0.5
+
+    def powers_of(parts: list[Floats], highest: int) -> list[Floats]:
+        # Offsets come in pairs of either sign.
+        before, after = parts[half - 1 :: -1], parts[half:]
+        signed = [
+            [combine(*pair) for pair in zip(after, before, strict=True)]
+            for combine in (np.add, np.subtract)[: 1 + highest]
+        ]
+        return [_combined(signed[power % 2], offsets**power) for power in range(1 + highest)]
+
+    # Down first, along whole rows, as across them fewer numbers are left.
+    down = powers_of([image[row::size] for row in range(size)], max(b for _, b in powers))
+    across = [
+        powers_of([total[:, column::size] for column in range(size)], max(a for a, _ in powers))
+        for total in down
+    ]
+    return {(a, b): across[b][a] for a, b in powers}
 
 
-def _count_from(moments: dict[tuple[int, int], Float64], x: Float64, y: Float64) -> None:
+def _combined(parts: list[Floats], factors: Floats) -> Floats:
+    total: Floats = parts[0] * factors[0]
+    for part, factor in zip(parts[1:], factors[1:], strict=True):
+        total += part * factor if factor != 1 else part
+    return total
+
+
+def _count_from(moments: Moments, x: Float64, y: Float64) -> None:
     """Have moments, of all powers up to the highest, counted from (x, y)."""
     total = moments[0, 0]
     if (2, 0) in moments:

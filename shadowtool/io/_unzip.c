@@ -16,52 +16,69 @@
 #include <emmintrin.h>
 #endif
 
-static void add_up(uint8_t *bytes, Py_ssize_t size)
+/* What is added up over so many bytes: the sum of their differences, without the 128 of each. */
+static uint8_t total(const uint8_t *bytes, Py_ssize_t size)
 {
-    uint8_t sum = 128;
+    uint8_t sum = 0;
     Py_ssize_t at = 0;
 #ifdef __SSE2__
-    const __m128i offset = _mm_set1_epi8((char)128);
-    __m128i before = offset;
-    for (; at + 16 <= size; at += 16) {
-        __m128i sums = _mm_xor_si128(_mm_loadu_si128((__m128i *)(bytes + at)), offset);
-        sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 1));
-        sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 2));
-        sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 4));
-        sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 8));
-        _mm_storeu_si128((__m128i *)(bytes + at), _mm_add_epi8(sums, before));
-        /* The last of them in every place: only one addition waits for the round before. */
-        __m128i last = _mm_srli_si128(sums, 15);
-        last = _mm_shufflelo_epi16(_mm_unpacklo_epi8(last, last), 0);
-        before = _mm_add_epi8(before, _mm_unpacklo_epi64(last, last));
-    }
-    if (at)
-        sum = bytes[at - 1];
+    __m128i sums = _mm_setzero_si128();
+    for (; at + 16 <= size; at += 16)
+        sums = _mm_add_epi8(sums, _mm_loadu_si128((const __m128i *)(bytes + at)));
+    /* Sixteen times 128 is nothing to a byte. */
+    sums = _mm_sad_epu8(sums, _mm_setzero_si128());
+    sum = (uint8_t)(_mm_cvtsi128_si32(sums) + _mm_extract_epi16(sums, 4));
 #endif
-    for (; at < size; at++) {
+    for (; at < size; at++)
         sum = (uint8_t)(sum + bytes[at] - 128);
-        bytes[at] = sum;
-    }
+    return sum;
 }
 
-static void weave(const uint8_t *even, const uint8_t *odd, uint8_t *target, Py_ssize_t size)
-{
-    Py_ssize_t pairs = size / 2, pair = 0;
 #ifdef __SSE2__
-    for (; pair + 16 <= pairs; pair += 16) {
-        __m128i first = _mm_loadu_si128((const __m128i *)(even + pair));
-        __m128i second = _mm_loadu_si128((const __m128i *)(odd + pair));
-        __m128i *place = (__m128i *)(target + 2 * pair);
+/* Sixteen bytes added up, from what comes before them on; it becomes the last in every place. */
+static inline __m128i added_up(const uint8_t *bytes, __m128i *before)
+{
+    __m128i sums = _mm_loadu_si128((const __m128i *)bytes);
+    sums = _mm_xor_si128(sums, _mm_set1_epi8((char)128));
+    sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 1));
+    sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 2));
+    sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 4));
+    sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 8));
+    __m128i result = _mm_add_epi8(sums, *before);
+    /* Only one addition waits for the round before. */
+    __m128i last = _mm_srli_si128(sums, 15);
+    last = _mm_shufflelo_epi16(_mm_unpacklo_epi8(last, last), 0);
+    *before = _mm_add_epi8(*before, _mm_unpacklo_epi64(last, last));
+    return result;
+}
+#endif
+
+/* The bytes of a chunk as they were: both halves added up, and put at even and odd places. */
+static void restore(const uint8_t *sorted, uint8_t *target, Py_ssize_t size)
+{
+    Py_ssize_t pairs = size / 2, at = 0;
+    const uint8_t *even = sorted, *odd = sorted + (size + 1) / 2;
+    /* One half goes on where the other ends. */
+    uint8_t last_even = 128, last_odd = (uint8_t)(128 + total(even, (size + 1) / 2));
+#ifdef __SSE2__
+    __m128i before_even = _mm_set1_epi8((char)last_even);
+    __m128i before_odd = _mm_set1_epi8((char)last_odd);
+    for (; at + 16 <= pairs; at += 16) {
+        __m128i first = added_up(even + at, &before_even);
+        __m128i second = added_up(odd + at, &before_odd);
+        __m128i *place = (__m128i *)(target + 2 * at);
         _mm_storeu_si128(place, _mm_unpacklo_epi8(first, second));
         _mm_storeu_si128(place + 1, _mm_unpackhi_epi8(first, second));
     }
+    last_even = (uint8_t)_mm_cvtsi128_si32(before_even);
+    last_odd = (uint8_t)_mm_cvtsi128_si32(before_odd);
 #endif
-    for (; pair < pairs; pair++) {
-        target[2 * pair] = even[pair];
-        target[2 * pair + 1] = odd[pair];
+    for (; at < pairs; at++) {
+        target[2 * at] = last_even = (uint8_t)(last_even + even[at] - 128);
+        target[2 * at + 1] = last_odd = (uint8_t)(last_odd + odd[at] - 128);
     }
     if (size % 2)
-        target[size - 1] = even[pairs];
+        target[size - 1] = (uint8_t)(last_even + even[pairs] - 128);
 }
 
 /* OpenEXR's exr_uncompress_buffer: context, source, target, and how much came of it. */
@@ -104,8 +121,7 @@ static Py_ssize_t unzip(inflate_t inflate, const Py_buffer *data, const Py_buffe
             inflate(NULL, file + start, (size_t)stored, scratch, (size_t)expected, &inflated) ||
             inflated != (size_t)expected)
             return chunk;
-        add_up(scratch, expected);
-        weave(scratch, scratch + (expected + 1) / 2, bytes, expected);
+        restore(scratch, bytes, expected);
     }
     return chunk;
 }

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import cv2
 import numpy as np
@@ -317,6 +317,42 @@ def read_image(path: Path, apart: bool = False) -> Image:
         return _decode_exr(path, file, apart)
 
 
+class Made(NamedTuple):
+    """What was made of a picture's colours: `Header`, values (H, W), and the file's fingerprint."""
+
+    header: Header
+    values: NDArray[Any]
+    fingerprint: str
+
+
+def read_made(path: Path, make: scanlines.Make, transfer: str = "auto") -> Made:
+    """Read a picture of which only something made of its colours is wanted; it is made while they
+    are close at hand, and there is never room for them all.
+
+    Args:
+        make: (n, W) of the three channels, (n, W) each, as `Image.colours` gives them; each of its
+            values by those of the same pixel alone, and 0 of 0.
+
+    Raises:
+        InputError, DamagedFileError: as `read_image`; InputError also if there is no colour.
+    """
+    if path.suffix.lower() == PNG:
+        image = read_image(path)
+    else:
+        taken = resolve_transfer(transfer, path)
+
+        def of_stored(*channels: NDArray[Any]) -> NDArray[Any]:
+            return make(*(decode(values, taken) for values in channels))
+
+        with unchanging(path) as file:
+            image = _decode_exr(path, file, apart=True, make=of_stored)
+    if scanlines.MADE in image.layers:
+        values = image.layers[scanlines.MADE]
+    else:
+        values = make(*image.colours(transfer))
+    return Made(image.header, values, image.fingerprint)
+
+
 def write_exr(
     path: Path,
     channels: Mapping[str, NDArray[Any]],
@@ -509,7 +545,7 @@ def _window(path: Path, raw: Mapping[str, Any], name: str) -> tuple[Corner, Corn
     return (first[0], first[1]), (last[0], last[1])
 
 
-def _decode_exr(path: Path, file: File, apart: bool) -> Image:
+def _decode_exr(path: Path, file: File, apart: bool, make: scanlines.Make | None = None) -> Image:
     # The header first: a picture that is refused must not be decoded, and a damaged part of a
     # multi-part file vanishes without a word when the pixels are read.
     listed = _open_exr(path, file.source, header_only=True)
@@ -518,7 +554,7 @@ def _decode_exr(path: Path, file: File, apart: bool) -> Image:
     channels: Mapping[str, NDArray[Any] | None] | None = None
     # What is left to OpenEXR need not be in memory.
     if len(listed.parts) == 1 and scanlines.decodes(int(raw["compression"])):
-        channels = scanlines.decode(file.content, apart)
+        channels = scanlines.decode(file.content, apart, make)
     if channels is None:
         channels = _channels(path, file.source, listed, apart)
     first, last = _window(path, raw, "dataWindow")

@@ -8,7 +8,7 @@ OpenEXR, and so is every verdict on a damaged one.
 import contextlib
 import struct
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -25,6 +25,7 @@ except ImportError:
     _unzip = None  # type: ignore[assignment]
 
 Bytes = NDArray[np.uint8]
+Make = Callable[..., NDArray[Any]]
 
 _MAGIC = b"v/1\x01"
 # The version, and a flag that says nothing but that names may be long: one part, in scanlines.
@@ -41,8 +42,10 @@ _ROWS = {b"\x00": 1, b"\x02": 1, b"\x03": 16}
 _TYPES = (np.dtype(np.uint32), np.dtype(np.float16), np.dtype(np.float32))
 # Names by which OpenEXR makes several channels one array, beside R, G, B and A.
 _JOINED = frozenset("rgba")
-# So many chunks are decoded, and then joined while they are close at hand.
-_BAND = 4
+# So many rows are decoded, and then worked on while they are close at hand.
+_BAND = 64
+# The name of what is made of the channels; no channel has none.
+MADE = ""
 # No deflated byte stands for more.
 _MOST_INFLATED = 1032
 
@@ -102,14 +105,18 @@ def _inflate() -> int | None:
     return None if _unzip is None or sys.byteorder != "little" else inflating()
 
 
-def decode(data: bytes, apart: bool = False) -> dict[str, NDArray[Any]] | None:
+def decode(
+    data: bytes, apart: bool = False, make: Make | None = None
+) -> dict[str, NDArray[Any]] | None:
     """Channels by name, of the data window's size; float16, float32 or uint32.
 
     Args:
         data: a whole file.
         apart: leave R, G, B and A each for itself.
+        make: what is wanted instead of R, G and B; it is given some rows of these at a time.
 
     Returns:
+        With ``make``, if there are R, G and B: what was made of them, under `MADE`, and no more.
         Arrays (H, W), whose rows lie apart from each other in memory. Unless ``apart``, R, G and B,
         or R, G, B and A, if they are of one type and nothing is beside them, are one array
         (H, W, C) under these letters. None for a file that isn't whole, or isn't of one part in
@@ -122,6 +129,8 @@ def decode(data: bytes, apart: bool = False) -> dict[str, NDArray[Any]] | None:
     with contextlib.suppress(struct.error, ValueError, LookupError, MemoryError):
         layout = _layout(data)
         chunks = _Chunks(data, layout, inflate if layout.packed else 0)
+        if make is not None and set("RGB") <= layout.channels.keys():
+            return {MADE: _made(chunks, layout, make)}
         colour = layout.colour()
         if colour and not apart:
             return {colour: _joined(chunks, layout, colour)}
@@ -212,6 +221,30 @@ class _Chunks:
             raise ValueError("a chunk is damaged, or missing")
 
 
+def _by_bands(chunks: _Chunks, layout: _Layout) -> Iterator[tuple[slice, Bytes]]:
+    """Which rows, and their bytes (N, bytes of a row), which the next ones overwrite. Raises as
+    `_Chunks` does."""
+    together = -(-_BAND // layout.rows)
+    band = np.empty((min(together * layout.rows, layout.height), layout.length), np.uint8)
+    for first in range(0, chunks.count, together):
+        start = first * layout.rows
+        rows = band[: layout.height - start]
+        chunks.fill(rows, first)
+        yield slice(start, start + len(rows)), rows
+
+
+def _made(chunks: _Chunks, layout: _Layout, make: Make) -> NDArray[Any]:
+    """What is made of R, G and B, (H, W). Raises as `_Chunks` does."""
+    made: NDArray[Any] | None = None
+    for rows, stored in _by_bands(chunks, layout):
+        part = make(*(layout.values(stored, name) for name in "RGB"))
+        if made is None:
+            made = np.empty((layout.height, layout.width), part.dtype)
+        made[rows] = part
+    assert made is not None
+    return made
+
+
 def _joined(chunks: _Chunks, layout: _Layout, names: str) -> NDArray[Any]:
     """Channels of one type as one array (H, W, C). Raises as `_Chunks` does."""
     kind = layout.channels[names[0]].kind
@@ -219,10 +252,7 @@ def _joined(chunks: _Chunks, layout: _Layout, names: str) -> NDArray[Any]:
     # What only moves channels about takes halfs as integers of their size.
     bits: NDArray[np.integer[Any]]
     bits = joined.view(np.uint16 if kind.itemsize == 2 else np.int32)
-    band = np.empty((min(_BAND * layout.rows, layout.height), layout.length), np.uint8)
-    for first in range(0, chunks.count, _BAND):
-        target = bits[first * layout.rows : (first + _BAND) * layout.rows]
-        rows = band[: len(target)]
-        chunks.fill(rows, first)
-        cv2.merge([layout.values(rows, name).view(bits.dtype) for name in names], dst=target)
+    for rows, stored in _by_bands(chunks, layout):
+        channels = [layout.values(stored, name).view(bits.dtype) for name in names]
+        cv2.merge(channels, dst=bits[rows])
     return joined

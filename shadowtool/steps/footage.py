@@ -18,15 +18,25 @@ from shadowtool.core.noise import (
     sample_positions,
     thin,
 )
+from shadowtool.core.shadow_time import luminance_halfs
 from shadowtool.core.trembling import UNSTEADY, strips
 from shadowtool.errors import DamagedFileError, InputError
-from shadowtool.io.image import PNG, Header, Image, read_header, read_image, resolve_transfer
+from shadowtool.io.image import (
+    PNG,
+    Header,
+    Image,
+    read_header,
+    read_image,
+    read_made,
+    resolve_transfer,
+)
 from shadowtool.io.products import holds_codes, in_place
 from shadowtool.io.sequence import Frame, Sequence, open_sequence
 from shadowtool.parallel import ordered_map
 
 logger = logging.getLogger(__name__)
 
+Float16 = NDArray[np.float16]
 Float32 = NDArray[np.float32]
 
 
@@ -73,6 +83,14 @@ class Footage:
         image = read_image(self.sequence.path(frame), apart)
         _require_same(image.path, image.header, self.header, self.sequence.pattern)
         return image
+
+    def luminance(self, frame: Frame) -> tuple[Float16, str]:
+        """(H, W) as of `luminance_halfs`, where the camera saw it, and the file's fingerprint.
+        Raises as `image`."""
+        path = self.sequence.path(frame)
+        header, gray, mark = read_made(path, luminance_halfs, self.transfer)
+        _require_same(path, header, self.header, self.sequence.pattern)
+        return gray, mark
 
     def read(self, frame: Frame) -> NDArray[np.floating]:
         """(H, W, 3) linear light, from the vantage; float16 where the file holds linear halfs."""

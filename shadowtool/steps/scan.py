@@ -249,12 +249,21 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
 
     def read(position: int) -> _Seen | None:
         try:
-            image = footage.image(frames[position], apart=True)
+            sampled = position == 0 or position in samples.values()
+            return whole(position) if sampled else gray_alone(position)
         except MissingError as error:
             if run.missing == "skip":
                 say_skipped(error)
                 return None
             raise
+
+    def gray_alone(position: int) -> _Seen:
+        gray, mark = footage.luminance(frames[position])
+        gray = displaced(gray, footage.off(gray))
+        return _Seen(gray, sampled_areas(gray), None, None, mark)
+
+    def whole(position: int) -> _Seen:
+        image = footage.image(frames[position], apart=True)
         colours = image.colours(footage.transfer)
         sample = picture = None
         if position == 0:
@@ -310,7 +319,7 @@ def _looked_at_again(
     look = SecondLook(crossings, crossings.lost)
 
     def read(frame: Frame) -> Float16:
-        gray = luminance_halfs(*footage.image(frame, apart=True).colours(footage.transfer))
+        gray, _ = footage.luminance(frame)
         return displaced(gray, footage.off(gray))
 
     for done, (gray, own) in enumerate(

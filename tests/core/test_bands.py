@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from shadowtool.core.bands import bands, blocks, in_all_channels
+from shadowtool.core.bands import bands, blocks, in_all_channels, overlapping_bands
 
 
 @pytest.mark.parametrize(
@@ -33,3 +33,25 @@ def test_every_value_is_in_one_block(count):
     parts = [range(count)[part] for part in blocks(count, together=4)]
     assert [place for part in parts for place in part] == list(range(count))
     assert all(len(part) == 4 for part in parts[:-1])
+
+
+@pytest.mark.parametrize("height", [0, 1, 15, 191, 192, 1080, 1081, 2160])
+@pytest.mark.parametrize("reach", [0, 1, 60, 5000])
+def test_bands_with_what_lies_around_them_make_up_the_picture(height: int, reach: int) -> None:
+    seen = np.zeros(height, int)
+    for rows, own in overlapping_bands(height, reach):
+        seen[rows][own] += 1
+        first, last = rows.start + own.start, rows.start + own.stop
+        assert first % 16 == 0
+        assert rows.start == max(first - reach, 0)
+        assert rows.stop == min(last + reach, height)
+    assert (seen == 1).all()
+
+
+@pytest.mark.parametrize(("height", "reach"), [(1080, 8), (1080, 60), (2160, 60), (2160, 84)])
+def test_less_is_read_twice_than_once_and_bands_are_alike(height: int, reach: int) -> None:
+    bands = overlapping_bands(height, reach)
+    read = sum(rows.stop - rows.start for rows, _ in bands)
+    assert read < 1.5 * height
+    own = [inner.stop - inner.start for _, inner in bands]
+    assert max(own) - min(own) < max(own) / 4

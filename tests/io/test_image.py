@@ -29,6 +29,7 @@ from shadowtool.io.image import (
     decode,
     read_header,
     read_image,
+    read_made,
     resolve_transfer,
     to_code,
     write_exr,
@@ -585,6 +586,41 @@ def test_colours_of_other_pictures_are_those_of_rgb(tmp_path, png):
     for path in (grey, layer, png):
         image = read_image(path, apart=True)
         np.testing.assert_array_equal(np.stack(image.colours(), axis=-1), image.rgb())
+
+
+def sum_of(red, green, blue):
+    return (red + 2 * green + 4 * blue).astype(np.float32)
+
+
+@pytest.mark.parametrize("types", ["eff", "eee", "fff", "III"])
+@pytest.mark.parametrize("compression", ["ZIP", "PIZ"])
+@pytest.mark.parametrize("transfer", ["auto", "srgb"])
+def test_what_is_made_of_colours_is_made_of_those_of_the_picture(
+    types, compression, transfer, tmp_path
+):
+    channels = {n: (9 * random(4, 5)).astype(t) for n, t in zip("RGB", types, strict=True)}
+    window = {"dataWindow": box(2, 1, 5, 4), "displayWindow": box(0, 0, 6, 7)}
+    kind = getattr(OpenEXR, f"{compression}_COMPRESSION")
+    path = raw_exr(tmp_path / "a.exr", channels, compression=kind, **window)
+    image = read_image(path)
+    header, values, mark = read_made(path, sum_of, transfer)
+    np.testing.assert_array_equal(values, sum_of(*image.colours(transfer)))
+    assert (header, mark) == (image.header, image.fingerprint)
+
+
+def test_of_other_pictures_the_same_is_made(tmp_path, png):
+    grey = raw_exr(tmp_path / "y.exr", {"Y": random(4, 5)})
+    layer = raw_exr(tmp_path / "d.exr", {f"diffuse.{c}": random(4, 5) for c in "RGB"})
+    for path in (grey, layer, png):
+        image = read_image(path)
+        header, values, mark = read_made(path, sum_of)
+        np.testing.assert_array_equal(values, sum_of(*image.colours()))
+        assert (header, mark) == (image.header, image.fingerprint)
+
+
+def test_of_what_has_no_colour_nothing_is_made(tmp_path):
+    with pytest.raises(InputError, match="no R, G, B"):
+        read_made(raw_exr(tmp_path / "a.exr", {"U": random(4, 5), "V": random(4, 5)}), sum_of)
 
 
 @pytest.mark.parametrize("names", ["RG", "UV", "AB", "X", "NYX"])

@@ -102,6 +102,41 @@ def test_colour_with_something_beside_it_is_left_apart(tmp_path):
     assert sorted(found) == ["B", "G", "R", "Z"]
 
 
+def sum_of(red: np.ndarray, green: np.ndarray, blue: np.ndarray) -> np.ndarray:
+    return (red + 2 * green + 4 * blue).astype(np.float32)
+
+
+@pytest.mark.parametrize("kinds", ["eee", "fff", "efI"])
+@pytest.mark.parametrize("compression", [NONE, ZIPS, ZIP])
+@pytest.mark.parametrize("height", [1, 63, 64, 65, 200])
+@pytest.mark.parametrize("beside", ["", "A", "AZ"])
+def test_what_is_made_some_rows_at_a_time_is_what_is_made_of_all(
+    kinds, compression, height, beside, tmp_path
+):
+    rng = np.random.default_rng(height)
+    channels = {
+        name: rng.integers(0, 99, (height, 21)).astype(KINDS[kind])
+        for name, kind in zip("RGB", kinds, strict=True)
+    }
+    more = dict.fromkeys(beside, np.ones((height, 21), np.float32))
+    data = encoded(tmp_path / "a.exr", channels | more, compression=compression)
+    found = scanlines.decode(data, make=sum_of)
+    assert found is not None
+    assert list(found) == [scanlines.MADE]
+    assert same(found[scanlines.MADE], sum_of(*channels.values()))
+
+
+def test_where_there_is_no_colour_nothing_is_made(tmp_path):
+    one = np.ones((5, 4), np.float16)
+    found = scanlines.decode(encoded(tmp_path / "a.exr", {"Y": one, "R": one}), make=sum_of)
+    assert found is not None
+    assert sorted(found) == ["R", "Y"]
+
+
+def test_of_a_damaged_chunk_nothing_is_made(plain):
+    assert scanlines.decode(plain.read_bytes()[:-1], make=sum_of) is None
+
+
 def test_values_that_no_arithmetic_may_touch_come_back(tmp_path):
     every = np.arange(1 << 16, dtype=np.uint16).view(np.float16).reshape(256, 256)
     for channels in ({"Y": every}, dict.fromkeys("RGB", every)):

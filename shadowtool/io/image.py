@@ -321,7 +321,7 @@ class Made(NamedTuple):
     """What was made of a picture's colours: `Header`, values (H, W), and the file's fingerprint."""
 
     header: Header
-    values: NDArray[Any]
+    values: NDArray[np.float16]
     fingerprint: str
 
 
@@ -330,8 +330,9 @@ def read_made(path: Path, make: scanlines.Make, transfer: str = "auto") -> Made:
     are close at hand, and there is never room for them all.
 
     Args:
-        make: (n, W) of the three channels, (n, W) each, as `Image.colours` gives them; each of its
-            values by those of the same pixel alone, and 0 of 0.
+        make: is given the three channels as `Image.colours` gives them, but some rows at a time,
+            (N, W) each, and what it is to write to, (N, W) halfs; each of these by the same pixel's
+            values alone, and 0 of 0.
 
     Raises:
         InputError, DamagedFileError: as `read_image`; InputError also if there is no colour.
@@ -341,15 +342,19 @@ def read_made(path: Path, make: scanlines.Make, transfer: str = "auto") -> Made:
     else:
         taken = resolve_transfer(transfer, path)
 
-        def of_stored(*channels: NDArray[Any]) -> NDArray[Any]:
-            return make(*(decode(values, taken) for values in channels))
+        def of_stored(
+            red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any], made: NDArray[np.float16]
+        ) -> None:
+            make(decode(red, taken), decode(green, taken), decode(blue, taken), made)
 
         with unchanging(path) as file:
             image = _decode_exr(path, file, apart=True, make=of_stored)
     if scanlines.MADE in image.layers:
         values = image.layers[scanlines.MADE]
     else:
-        values = make(*image.colours(transfer))
+        red, green, blue = image.colours(transfer)
+        values = np.empty(red.shape, np.float16)
+        make(red, green, blue, values)
     return Made(image.header, values, image.fingerprint)
 
 

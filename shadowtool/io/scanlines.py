@@ -25,7 +25,8 @@ except ImportError:
     _unzip = None  # type: ignore[assignment]
 
 Bytes = NDArray[np.uint8]
-Make = Callable[..., NDArray[Any]]
+# What makes something of R, G and B, (N, W) each, and writes it to an array of halfs (N, W).
+Make = Callable[[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.float16]], object]
 
 _MAGIC = b"v/1\x01"
 # The version, and a flag that says nothing but that names may be long: one part, in scanlines.
@@ -233,15 +234,12 @@ def _by_bands(chunks: _Chunks, layout: _Layout) -> Iterator[tuple[slice, Bytes]]
         yield slice(start, start + len(rows)), rows
 
 
-def _made(chunks: _Chunks, layout: _Layout, make: Make) -> NDArray[Any]:
+def _made(chunks: _Chunks, layout: _Layout, make: Make) -> NDArray[np.float16]:
     """What is made of R, G and B, (H, W). Raises as `_Chunks` does."""
-    made: NDArray[Any] | None = None
+    made = np.empty((layout.height, layout.width), np.float16)
     for rows, stored in _by_bands(chunks, layout):
-        part = make(*(layout.values(stored, name) for name in "RGB"))
-        if made is None:
-            made = np.empty((layout.height, layout.width), part.dtype)
-        made[rows] = part
-    assert made is not None
+        red, green, blue = (layout.values(stored, name) for name in "RGB")
+        make(red, green, blue, made[rows])
     return made
 
 

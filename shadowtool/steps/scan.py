@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -346,7 +347,7 @@ def _times(
     in_shade = loss < SHADE
     own[in_shade], own_error[in_shade] = np.nan, np.inf
     off = misled(duration, loss)
-    np.hypot(own_error, off, out=own_error)
+    cv2.magnitude(own_error, off, own_error)
     if (holes := _holes(numbers)).any():
         in_hole = np.append(False, holes)[crossings.at]
         own[in_hole], own_error[in_hole] = np.nan, np.inf
@@ -363,7 +364,7 @@ def _times(
     for _ in ordered_map(refine, overlapping_bands(len(own), windows.reach), jobs):
         pass
     # Neighbours are misled alike: it does not average out.
-    np.hypot(error, off, out=error)
+    cv2.magnitude(error, off, error)
     if (np.diff(numbers) != 1).any():
         # From positions among the frames to frame numbers, which are not one apart.
         spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))

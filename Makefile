@@ -1,8 +1,9 @@
 # `make` sets up and runs the sample shot; `make test` sets up and checks everything.
-# Both need python3 (3.11 or later) and nothing else; a C compiler makes reading EXR faster.
+# Both need python3 (3.11 or later) and nothing else; a C compiler makes it faster.
 
 PYTHON ?= python3
 BIN := .venv/bin
+COMPILED := shadowtool/core/_crossings.c shadowtool/io/_unzip.c
 
 .DEFAULT_GOAL := sample
 .PHONY: sample test bench bench-speed soak format readme clean
@@ -37,7 +38,7 @@ format: .venv/installed-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-.venv/installed-bench: pyproject.toml shadowtool/io/_unzip.c | .venv/bin/python
+.venv/installed-bench: pyproject.toml $(COMPILED) | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev,sample,bench]"
 	touch $@ .venv/installed-dev .venv/installed
 
@@ -53,12 +54,12 @@ clean:
 	$(PYTHON) -m venv .venv
 
 # Compiled once, for accounts that may not write here.
-.venv/installed: pyproject.toml shadowtool/io/_unzip.c | .venv/bin/python
+.venv/installed: pyproject.toml $(COMPILED) | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	$(BIN)/python -m compileall -q shadowtool
 	touch $@
 
-.venv/installed-dev: pyproject.toml shadowtool/io/_unzip.c | .venv/bin/python
+.venv/installed-dev: pyproject.toml $(COMPILED) | .venv/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	$(BIN)/python -m compileall -q shadowtool
 	touch $@ .venv/installed

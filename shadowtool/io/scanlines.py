@@ -43,8 +43,8 @@ _ROWS = {b"\x00": 1, b"\x02": 1, b"\x03": 16}
 _TYPES = (np.dtype(np.uint32), np.dtype(np.float16), np.dtype(np.float32))
 # Names by which OpenEXR makes several channels one array, beside R, G, B and A.
 _JOINED = frozenset("rgba")
-# So many rows are decoded, and then worked on while they are close at hand.
-_BAND = 64
+# Rows of so many bytes are decoded, and then worked on while they are close at hand.
+_BAND = 3 << 19
 # The name of what is made of the channels; no channel has none.
 MADE = ""
 # No deflated byte stands for more.
@@ -225,7 +225,7 @@ class _Chunks:
 def _by_bands(chunks: _Chunks, layout: _Layout) -> Iterator[tuple[slice, Bytes]]:
     """Which rows, and their bytes (N, bytes of a row), which the next ones overwrite. Raises as
     `_Chunks` does."""
-    together = -(-_BAND // layout.rows)
+    together = max(1, _BAND // (layout.rows * layout.length))
     band = np.empty((min(together * layout.rows, layout.height), layout.length), np.uint8)
     for first in range(0, chunks.count, together):
         start = first * layout.rows

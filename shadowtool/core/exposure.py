@@ -33,6 +33,9 @@ _SAME_LIGHT, _UNCLIPPED, _BRIGHTEST, _SURE = 0.03, 0.95, 0.995, 4.0
 _ROUNDS = 3
 # A take flickers if more than this part of its frames does.
 _MOSTLY = 0.5
+# Light is clipped that is no further than this below the most that frames hold, but for few pixels
+# that may be broken, in so many of the frames. Where less than half scatters it may be a wall.
+_AT_THE_TOP, _ALL_BUT_BROKEN, _IN_MOST, _SCATTERS = 0.998, 0.999, 0.5, 0.5
 # Into about so many areas a picture's longer side is divided.
 _AREAS = 160
 # At least this part of the pixels must agree, and so many.
@@ -128,6 +131,34 @@ def _unclipped(image: Float32) -> NDArray[np.bool_]:
         if values.size:
             clear &= channel < _UNCLIPPED * np.quantile(values, _BRIGHTEST)
     return clear
+
+
+def clipped_part(samples: Sequence[Float32], top: float | None) -> float:
+    """What part of a take holds more light than its files can say.
+
+    Clipped light is the most that there is, in most frames, and does not scatter.
+
+    Args:
+        samples: (h, w, 3) each, a few frames as they were shot, linear light.
+        top: the most that the files can hold; None if they have no such bound, as floats: then a
+            plateau counts, if light elsewhere scatters.
+
+    Returns:
+        The part of the pixels that are clipped in any channel; 0 of fewer than two samples.
+    """
+    if len(samples) < 2:
+        return 0.0
+    stack = np.stack(samples)
+    known = np.where(np.isfinite(stack), stack, 0)
+    most = np.quantile(known, _ALL_BUT_BROKEN, axis=(0, 1, 2))
+    clipped = (known >= _AT_THE_TOP * most).mean(axis=0) >= _IN_MOST
+    clipped &= most > (0 if top is None else _AT_THE_TOP * top)
+    if top is None:
+        still = (np.diff(known, axis=0) == 0).mean(axis=0) > _IN_MOST
+        rest = still[~clipped & (known > 0).any(axis=0)]
+        if not rest.size or rest.mean() > _SCATTERS:
+            return 0.0
+    return float(clipped.any(axis=-1).mean())
 
 
 def _means_ratio(image: Float32, reference: Float32, where: NDArray[np.bool_]) -> Float64:

@@ -25,6 +25,7 @@ from shadowtool.io.image import (
     PNG,
     Header,
     Image,
+    decode,
     read_header,
     read_image,
     read_made,
@@ -70,6 +71,13 @@ class Footage:
         """Whether a PNG's code values are taken as they are."""
         first = next(iter(self.sequence.files.values()))
         return self.transfer == "none" and first.suffix.lower() == PNG
+
+    @property
+    def top(self) -> float | None:
+        """The most light that a frame can hold; None for floats, which have no such bound."""
+        if self.header.bits is None:
+            return None
+        return float(decode(np.ones(1, np.float32), self.transfer)[0])
 
     def image(self, frame: Frame, apart: bool = False) -> Image:
         """Read a frame.

@@ -16,6 +16,7 @@ from shadowtool.core.beta import shadow_contrast
 from shadowtool.core.camera_motion import Place
 from shadowtool.core.exposure import (
     Gains,
+    clipped_part,
     common_reference,
     flickers,
     is_one,
@@ -85,6 +86,8 @@ Bool = NDArray[np.bool_]
 UNDER_A_CARD = "a scene under a card"
 # Of a scene under a card less than this part in its shadow is worth a word.
 _WELL_SHADED = 0.9
+# So is clipped light in more than this part of the picture.
+_CLIPPED = 0.01
 # Sampled frames are kept for the second reading up to so many bytes, as far as these with what the
 # estimate takes for each pixel stay below a gigabyte.
 _KEPT, _WITH_ESTIMATE, _PER_PIXEL = 500 << 20, 1000 << 20, 100
@@ -209,6 +212,7 @@ def plate(
         "held_out": take.held_out(),
         "pixels": pixels,
         "unseen": unseen,
+        "clipped": round(estimate.clipped, 4),
         "noise_at_mid_grey": [round(float(v), 6) for v in estimate.noise.sigma(np.full(3, 0.18))],
     }
 
@@ -286,6 +290,13 @@ def _advise(figures: Figures, take: "_Take", estimator: Estimator) -> None:
             else f"plates are off where texture is strong; hold it firmly, or give {cure}",
         )
     say_flickers(take.footage, take.bands)
+    if figures["clipped"] > _CLIPPED:
+        logger.warning(
+            "%s: %.1f%% of the picture is clipped: lit.exr is darker there than the light was, and"
+            " shadows are too light; expose less",
+            name,
+            100 * figures["clipped"],
+        )
     if figures.get("shaded") == 0:
         logger.warning("%s: no shadow moves over the scene", name)
     elif figures.get("own_evidence") == 0:
@@ -318,10 +329,12 @@ def _nothing_seen(take: "_Take") -> str:
 
 
 class _Estimate(NamedTuple):
-    """The lit plate, the take's noise, and how to come by the rest of the plates."""
+    """The lit plate, the take's noise, how much of it is clipped, and how to come by the rest of
+    the plates."""
 
     lit: NDArray[np.float32]
     noise: NoiseModel
+    clipped: float
     complete: Callable[[], tuple[Plates, Figures]]
 
 
@@ -514,9 +527,11 @@ class _Take:
 
 
 class _Samples(NamedTuple):
-    """What a first reading of some of the frames tells: noise, background and lit levels."""
+    """What a first reading of some of the frames tells: noise, background, lit levels, and how
+    much of them is clipped."""
 
     noise: NoiseModel
+    clipped: float
     levels: Levels
     read: int
 
@@ -550,6 +565,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         elif with_levels:
             grays[frame] = keyed(item.values, item.holdout).gray
     noise = noise_model(noise_levels(thinned))
+    clipped = clipped_part(list(thinned.values()), take.footage.top)
     apart = [frame for frame in grids if frame in spread]
     if take.footage.vantage is None:
         take.trembling = tremble(rows)
@@ -593,7 +609,7 @@ def _sample(take: _Take, frames: list[Frame], automatic: bool, with_levels: bool
         for item in take.shown(others, with_keys=True, last=False):
             if item is not None and item.keys is not None:
                 levels.add(item.keys.gray)
-    return _Samples(noise, levels.levels(), len(positions))
+    return _Samples(noise, clipped, levels.levels(), len(positions))
 
 
 def _spread(frames: int) -> list[int]:
@@ -619,12 +635,14 @@ def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
         if position in numbers:
             thinned[numbers[position]] = thin(item.values)
     plates = extremes.plates()
-    return _Estimate(plates.lit, noise_model(noise_levels(thinned)), lambda: (plates, {}))
+    noise = noise_model(noise_levels(thinned))
+    clipped = clipped_part(list(thinned.values()), take.footage.top)
+    return _Estimate(plates.lit, noise, clipped, lambda: (plates, {}))
 
 
 def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | None) -> _Estimate:
     """Means of lit and shaded frames, and the plane's ratio where the shadow fell in part."""
-    noise, levels, begun = _sample(take, frames, automatic, with_levels=True)
+    noise, clipped, levels, begun = _sample(take, frames, automatic, with_levels=True)
     estimate = RobustPlates(levels, noise)
     # What has been looked up in them is larger than they are.
     del levels
@@ -657,7 +675,7 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
         }
         return plates, figures
 
-    return _Estimate(lit, noise, complete)
+    return _Estimate(lit, noise, clipped, complete)
 
 
 def _other_holdouts(folder: Path, take: "_Take", given: Sequence | None) -> list[Path]:

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from shadowtool.core.exposure import (
     RunningGain,
+    clipped_part,
     common_reference,
     flickers,
     frame_gain,
@@ -298,3 +299,56 @@ def test_sampled_areas_are_means_of_runs(shape: tuple[int, int]) -> None:
         if shape[1] >= step
         else gray[::step][-1, 0]
     )
+
+
+def under_a_disk(noise: bool = True) -> list[np.ndarray]:
+    """A disk of shadow over the scene."""
+    frames = [SCENE.image(SCENE.disk(20.0 + 20 * i, 40, 15, soft=8)) for i in range(6)]
+    return [SCENE.noisy(frame, seed) for seed, frame in enumerate(frames)] if noise else frames
+
+
+@pytest.mark.parametrize("noise", [False, True])
+@pytest.mark.parametrize("top", [None, 1.0])
+def test_light_below_the_top_is_not_clipped(noise: bool, top: float | None) -> None:
+    assert (
+        clipped_part([0.9 * frame / SCENE.lit.max() for frame in under_a_disk(noise)], top) < 0.01
+    )
+
+
+@pytest.mark.parametrize("top", [None, 1.0])
+@pytest.mark.parametrize("channels", [[1], [0, 1, 2]])
+@pytest.mark.parametrize("part", [0.05, 0.3, 0.6])
+def test_light_that_is_cut_off_is_clipped(
+    top: float | None, channels: list[int], part: float
+) -> None:
+    """By so much, whether all channels are or one, and a single broken pixel is brighter."""
+    above = np.quantile(SCENE.lit, 1 - part, axis=(0, 1))
+    expected = (SCENE.lit >= above)[..., channels].any(axis=-1).mean()
+    frames = [frame / above for frame in under_a_disk()]
+    for frame in frames:
+        for channel in channels:
+            np.minimum(frame[..., channel], 1, out=frame[..., channel])
+        frame[3, 3] = 2 if top is None else 1
+    others = [channel for channel in range(3) if channel not in channels]
+    for frame in frames:
+        frame[..., others] *= 0.5
+    assert clipped_part(frames, top) == pytest.approx(expected, abs=0.05)
+
+
+def test_an_even_wall_in_a_clean_picture_is_not_clipped() -> None:
+    wall = np.full((30, 40, 3), 0.7, np.float32)
+    shade = [wall.copy() for _ in range(6)]
+    for number, frame in enumerate(shade):
+        frame[:, 5 * number : 5 * number + 8] *= 0.4
+    assert clipped_part(shade, None) == 0
+    assert clipped_part(shade, 1.0) == 0
+    assert clipped_part([frame / np.float32(0.7) for frame in shade], 1.0) == 1
+
+
+def test_of_nothing_nothing_is_clipped() -> None:
+    unknown = np.full((4, 5, 3), np.nan, np.float32)
+    black = np.zeros((4, 5, 3), np.float32)
+    for top in (None, 1.0):
+        for frame in (unknown, black):
+            assert clipped_part([frame] * 3, top) == 0
+        assert clipped_part([], top) == clipped_part([black + 1], top) == 0

@@ -5,10 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shadowtool.io.image import write_png
+from shadowtool.choices import Estimator
+from shadowtool.io.image import to_code, write_exr, write_png
 from shadowtool.steps.plate import plate
 from shadowtool.steps.run import Run
 from tests.conftest import HEIGHT, PLANE, WIDTH, shaded, soft_band, write_frames
+from tests.scene import Scene
+
+SCENE = Scene()
 
 
 def crossed() -> list[np.ndarray]:
@@ -53,3 +57,29 @@ def test_plates_are_made_anew_with_another_plane(tmp_path: Path) -> None:
         result = plate(take, tmp_path / "plates", plane=str(mask), run=Run(resume=True))
         kept.append(bool(result.kept))
     assert kept == [False, False, True]
+
+
+@pytest.mark.parametrize("estimator", ["robust", "minmax"])
+@pytest.mark.parametrize("suffix", [".exr", ".png"])
+@pytest.mark.parametrize("clipped", [False, True])
+def test_clipped_light_is_told_of(
+    estimator: Estimator,
+    suffix: str,
+    clipped: bool,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    folder = tmp_path / "take"
+    folder.mkdir()
+    gain = 1 / np.quantile(SCENE.lit, 0.8 if clipped else 1) / (1 if clipped else 1.1)
+    for number in range(12):
+        under = SCENE.image(SCENE.disk(20.0 + 10 * number, 40, 15))
+        light = np.minimum(gain * SCENE.noisy(under, number), 1)
+        if suffix == ".png":
+            write_png(folder / f"take.{1001 + number}.png", to_code(light))
+        else:
+            write_exr(folder / f"take.{1001 + number}.exr", {"RGB": light.astype(np.float16)})
+    result = plate(folder, tmp_path / "plates", estimator=estimator, holdout="none")
+    part = (gain * SCENE.lit >= 1).any(axis=-1).mean()
+    assert result.figures["clipped"] == pytest.approx(part, abs=0.05)
+    assert ("of the picture is clipped" in caplog.text) == clipped

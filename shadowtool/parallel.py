@@ -51,11 +51,6 @@ def _number(text: str) -> int:
     return int(text) if usual else 0
 
 
-def thread_count(jobs: int | None) -> int:
-    """How many threads ``jobs`` stands for; None for as many as `available_cpus`."""
-    return jobs or available_cpus()
-
-
 @contextlib.contextmanager
 def meanwhile(work: Callable[[], Result]) -> Iterator[Callable[[], Result]]:
     """Do one thing on a thread of its own while the block does others.
@@ -78,9 +73,9 @@ def ordered_map(
     turn; what is then under way is finished, what is not begun never is.
 
     Args:
-        jobs: threads, as of `thread_count`.
+        jobs: threads; None for `available_cpus`.
     """
-    count = thread_count(jobs)
+    count = jobs or available_cpus()
     cv2.setNumThreads(1)
     pool = ThreadPoolExecutor(count, thread_name_prefix="shadowtool")
     waiting: deque[Future[Result]] = deque()

@@ -34,7 +34,7 @@ from shadowtool.io.files import (
     unchanging,
     write_bytes,
 )
-from shadowtool.io.openexr_core import set_threads, set_zip_level
+from shadowtool.io.openexr_core import set_zip_level
 
 logger = logging.getLogger(__name__)
 
@@ -364,7 +364,6 @@ def write_exr(
     header: Header | None = None,
     provenance: Mapping[str, str] | None = None,
     quick: bool = False,
-    threads: int = 1,
 ) -> None:
     """Write a scanline EXR with ZIP compression, whole or not at all.
 
@@ -375,13 +374,11 @@ def write_exr(
         provenance: how the file was made; becomes string attributes.
         quick: search less for what repeats. A picture with grain takes half the time and up to
             a twentieth more room; a clean matte takes longer.
-        threads: how many of OpenEXR's own are to encode it, for a file that is alone; they make
-            the same bytes.
 
     Raises:
         RetryError, ShadowtoolError: as `write_bytes`.
     """
-    write_bytes(path, encode_exr(path, channels, header, provenance, quick, threads))
+    write_bytes(path, encode_exr(path, channels, header, provenance, quick))
 
 
 def encode_exr(
@@ -390,7 +387,6 @@ def encode_exr(
     header: Header | None = None,
     provenance: Mapping[str, str] | None = None,
     quick: bool = False,
-    threads: int = 1,
 ) -> memoryview:
     """The bytes that `write_exr` writes.
 
@@ -423,7 +419,7 @@ def encode_exr(
         attributes[_ATTRIBUTE + key] = value.encode("utf-8", "replace").decode()
     buffer = io.BytesIO()
     try:
-        with _writing.as_in(_Setting(_QUICK if quick else _USUAL, threads)):
+        with _zip_level.at(_QUICK if quick else _USUAL):
             OpenEXR.File(attributes, arrays).write(buffer)
     except RuntimeError as error:
         # Arrays are as they have to be: what fails is memory.
@@ -431,32 +427,22 @@ def encode_exr(
     return buffer.getbuffer()
 
 
-class _Setting(NamedTuple):
-    """How hard ZIP searches, and on how many threads it does."""
-
-    zip_level: int
-    threads: int
-
-
-class _Writing:
-    """How OpenEXR writes: one setting of its for all threads.
+class _ZipLevel:
+    """How hard ZIP searches: one setting of OpenEXR's for all threads.
 
     Who wants it otherwise waits till nobody writes, so that a file's bytes are always the same.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._now, self._writers = _Setting(_USUAL, 1), 0
+        self._now, self._writers = _USUAL, 0
 
     @contextlib.contextmanager
-    def as_in(self, setting: _Setting) -> Iterator[None]:
+    def at(self, level: int) -> Iterator[None]:
         with self._changed:
-            self._changed.wait_for(lambda: self._now == setting or not self._writers)
-            if self._now.zip_level != setting.zip_level:
-                set_zip_level(setting.zip_level)
-            if self._now.threads != setting.threads:
-                set_threads(setting.threads)
-            self._now = setting
+            self._changed.wait_for(lambda: self._now == level or not self._writers)
+            if self._now != level:
+                self._set(level)
             self._writers += 1
         try:
             yield
@@ -465,8 +451,12 @@ class _Writing:
                 self._writers -= 1
                 self._changed.notify_all()
 
+    def _set(self, level: int) -> None:
+        set_zip_level(level)
+        self._now = level
 
-_writing = _Writing()
+
+_zip_level = _ZipLevel()
 
 
 def write_png(

@@ -15,15 +15,6 @@ def set_zip_level(level: int) -> None:
         setter(level)
 
 
-def set_threads(count: int) -> None:
-    """How many threads encode one file; 1 for the one that asks for it.
-
-    A version that can't be told does it alone, and writes the same.
-    """
-    if setter := getattr(OpenEXR, "set_global_thread_count", None):
-        setter(count if count > 1 else 0)
-
-
 def inflating() -> int | None:
     """The address of ``exr_uncompress_buffer``; None where a build hides it."""
     return ctypes.cast(_function("exr_uncompress_buffer"), ctypes.c_void_p).value

@@ -148,22 +148,18 @@ def encode_times(
     plane: NDArray[np.bool_] | None,
     header: Header,
     provenance: Provenance,
-    threads: int = 1,
 ) -> memoryview:
     """The bytes of the folder's ``scan.exr``, which take a while and don't depend on the lines.
 
     Of errors and contrast a half keeps all digits that say something; contrast stays a single
     float, as other programs expect it.
-
-    Args:
-        threads: as of `encode_exr`.
     """
     layers = {part.name: getattr(times, part.name) for part in fields(times)}
     layers |= {name: rounded(layers[name]) for name in ("error", "own_error")}
     layers["contrast"] = to_float(rounded(times.contrast))
     if plane is not None:
         layers["plane"] = plane.astype(np.float16)
-    return encode_exr(folder / SCAN, layers, header, provenance, quick=True, threads=threads)
+    return encode_exr(folder / SCAN, layers, header, provenance, quick=True)
 
 
 def write_scan(
@@ -275,19 +271,13 @@ def _count(value: Any) -> int:
     return value
 
 
-def write_warp(
-    path: Path, warp_map: WarpMap, header: Header, provenance: Provenance, threads: int = 1
-) -> None:
-    """Write an ST map: R, G = u, v, B = 0, A = confidence; float32.
-
-    Args:
-        threads: as of `encode_exr`.
-    """
+def write_warp(path: Path, warp_map: WarpMap, header: Header, provenance: Provenance) -> None:
+    """Write an ST map: R, G = u, v, B = 0, A = confidence; float32."""
     height, width = warp_map.error.shape
     layers = np.zeros((height, width, 4), np.float32)
     layers[..., :2] = to_st_map(warp_map.warp, width, height)
     layers[..., 3] = warp_map.confidence
-    write_exr(path, {"RGBA": layers}, header, provenance, threads=threads)
+    write_exr(path, {"RGBA": layers}, header, provenance)
 
 
 def map_place(path: Path) -> Path:

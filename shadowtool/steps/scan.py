@@ -46,7 +46,7 @@ from shadowtool.io.files import fingerprint_file, make_folder
 from shadowtool.io.image import write_png
 from shadowtool.io.products import LINES, MANIFEST, SCAN, encode_times, write_scan
 from shadowtool.io.sequence import Frame, frame_range
-from shadowtool.parallel import meanwhile, ordered_map, thread_count
+from shadowtool.parallel import meanwhile, ordered_map
 from shadowtool.steps.footage import Footage, open_footage, say_assumed
 from shadowtool.steps.plane import read_plane
 from shadowtool.steps.run import (
@@ -178,9 +178,9 @@ def scan(
     known = {frame: fingerprint_file(footage.sequence.path(frame)) for frame in skipped}
     known |= dict(zip(used, marks, strict=True))
     mark = _mark(recipe, plane_mark, {frame: known[frame] for frame in frames})
-    provenance, threads = recipe.provenance(mark), thread_count(run.jobs)
+    provenance = recipe.provenance(mark)
     with meanwhile(
-        lambda: encode_times(output, times, region, footage.header, provenance, threads)
+        lambda: encode_times(output, times, region, footage.header, provenance)
     ) as encoded:
         points = zero_crossings(times.time, region, numbers)
         lines = _lines(points, numbers, raised, footage.sequence.pattern)

@@ -48,7 +48,6 @@ from shadowtool.io.products import (
     write_warp,
 )
 from shadowtool.io.sequence import Frame, Sequence, frame_file, open_sequence
-from shadowtool.parallel import thread_count
 from shadowtool.steps.footage import require_size
 from shadowtool.steps.run import (
     Figures,
@@ -313,7 +312,7 @@ def _solve(
         )
     provenance = recipe.provenance(mark)
     make_folder(output)
-    write_warp(output / WARP, result, target.header, provenance, thread_count(run.jobs))
+    write_warp(output / WARP, result, target.header, provenance)
     write_png(output / PICTURE, warp_picture(in_all_channels(shown), result), provenance)
     write_manifest(output, recipe, mark, figures)
     return Result("warp", output, [], 0, (), figures)

@@ -25,7 +25,7 @@ from shadowtool.io.files import fingerprint
 from shadowtool.io.image import (
     Header,
     Image,
-    _Writing,
+    _ZipLevel,
     decode,
     read_header,
     read_image,
@@ -220,32 +220,16 @@ def test_quick_and_other_writers_do_not_mix(tmp_path):
     assert sizes == [alone[number % 3 != 0] for number in range(24)]
 
 
-@pytest.mark.parametrize("quick", [False, True])
-def test_on_several_threads_a_file_is_the_same(quick, tmp_path):
-    values = np.tile(random(200, 40, 3), (1, 4, 1))
-
-    def written(number):
-        path = tmp_path / f"{number}.exr"
-        write_exr(path, {"RGB": values}, quick=quick, threads=1 + number % 3)
-        return path.read_bytes()
-
-    alone = written(0)
-    assert written(1) == written(2) == alone
-    with ThreadPoolExecutor(4) as pool:
-        assert set(pool.map(written, range(24))) == {alone}
-
-
 def test_quick_files_are_written_where_openexr_hides_the_setting(tmp_path, monkeypatch):
     def hidden(name):
         raise OSError
 
     monkeypatch.setattr("ctypes.CDLL", hidden)
-    monkeypatch.delattr("OpenEXR.set_global_thread_count", raising=False)
     # What it then takes the setting for must not outlive the test.
-    monkeypatch.setattr("shadowtool.io.image._writing", _Writing())
+    monkeypatch.setattr("shadowtool.io.image._zip_level", _ZipLevel())
     values = random(40, 30, 3)
     for quick in (True, False):
-        write_exr(tmp_path / "a.exr", {"RGB": values}, quick=quick, threads=2)
+        write_exr(tmp_path / "a.exr", {"RGB": values}, quick=quick)
         np.testing.assert_array_equal(read_image(tmp_path / "a.exr").layers["RGB"], values)
 
 

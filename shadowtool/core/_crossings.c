@@ -118,6 +118,8 @@ static void search(const state_t *state, const pass_t *pass, Py_ssize_t pixel, i
         found++;
     if (found < start + 2)
         found = start + 2;
+    if (found >= pass->all)
+        return;
     if (found - 2 >= old)
         floor = least(floor, after);
     for (Py_ssize_t row = since; row <= found - 2; row++)

@@ -1,11 +1,11 @@
-from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 def settle(
     state: tuple[Any, ...],
-    frames: Sequence[NDArray[Any]],
+    frames: list[NDArray[np.int16]],
     seen: int,
     first: int,
     nearly_lit: float,

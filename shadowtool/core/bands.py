@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 # Values in a band: an array of as many single floats is 1.5 MB. Smaller ones fit the cache better,
 # but threads that work through many bands wait for one another at each.
 _VALUES = 3 << 17
-# Rows that are worked through with those around them, at least, and times as many as these are;
-# always a multiple of this, by which others count in cells.
+# Rows that are worked through with those around them: about so many, or so many times as many as
+# these are, as what is read twice costs more than threads that have no band of their own gain;
+# always a multiple of the last number, as others count in cells.
 _ROWS, _REACHES, _WHOLE = 192, 4, 16
 _ONES = np.ones((1, 3), np.float32)
 
@@ -46,7 +47,7 @@ def overlapping_bands(
         For each band the rows that are to be read, and where in these its own rows lie.
     """
     if rows is None:
-        count = max(height // max(_ROWS, _REACHES * reach), 1)
+        count = max(round(height / max(_ROWS, _REACHES * reach)), 1)
         rows = -(-max(height, 1) // (count * _WHOLE)) * _WHOLE
     cut = []
     for first in range(0, height, rows):

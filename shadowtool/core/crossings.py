@@ -274,7 +274,7 @@ def _look(
     state: _State, seen: Sequence[Int16], new: Sequence[Int16], number: int, holes: bool
 ) -> None:
     """Look at new frames, the first of which has the number, for pixels that cross their threshold
-    in them; `_crossings.c` does the same in half the time.
+    in them; `_crossings.c` does the same without arrays of places.
 
     Only where a frame is the darkest so far can the crossing move.
 

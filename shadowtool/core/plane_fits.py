@@ -122,7 +122,8 @@ def fit_planes(
     found = known & np.isfinite(spread)
     best[~found] = np.nan
     spread[~found] = np.inf
-    return best, np.sqrt(spread, out=spread)
+    # Of errors of next to nothing rounding leaves less.
+    return best, np.sqrt(np.maximum(spread, 0))
 
 
 def _known(value: Float32, error: Float32) -> tuple[Bool, Float32]:
@@ -298,7 +299,7 @@ def _choose(fitted: _Fitted, first: int, chosen: _Choice) -> None:
         first: the row among those fitted that is the first of the choice.
     """
     # And with what smaller windows told.
-    allowed = np.sqrt(chosen.variance)
+    allowed = np.sqrt(np.maximum(chosen.variance, 0))
     allowed *= np.float32(_AGREES)
     least = np.maximum(chosen.least, chosen.value - allowed)
     most = np.minimum(chosen.most, chosen.value + allowed)

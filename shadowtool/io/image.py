@@ -326,8 +326,8 @@ class Made(NamedTuple):
 
 
 def read_made(path: Path, make: scanlines.Make, transfer: str = "auto") -> Made:
-    """Read a picture of which only something made of its colours is wanted; it is made while they
-    are close at hand, and there is never room for them all.
+    """Read a picture of which only something made of its colours is wanted. Of scanlines it is made
+    while these are close at hand, and no more is kept of them.
 
     Args:
         make: is given the three channels as `Image.colours` gives them, but some rows at a time,

@@ -127,8 +127,11 @@ def decode(
     version = int.from_bytes(data[4:8], "little")
     if inflate is None or data[:4] != _MAGIC or version & ~_LONG_NAMES != _VERSION:
         return None
-    with contextlib.suppress(struct.error, ValueError, LookupError, MemoryError):
+    try:
         layout = _layout(data)
+    except (struct.error, ValueError, LookupError):
+        return None
+    with contextlib.suppress(_DamagedError, MemoryError):
         chunks = _Chunks(data, layout, inflate if layout.packed else 0)
         if make is not None and set("RGB") <= layout.channels.keys():
             return {MADE: _made(chunks, layout, make)}
@@ -196,16 +199,20 @@ def _channels(listed: bytes, width: int) -> tuple[dict[str, _Place], int]:
     return channels, length
 
 
+class _DamagedError(Exception):
+    """A file isn't whole."""
+
+
 class _Chunks:
     """A file's chunks, each of them some rows.
 
     Raises:
-        ValueError: the file isn't whole.
+        _DamagedError: the file isn't whole.
     """
 
     def __init__(self, data: bytes, layout: _Layout, inflate: int) -> None:
         if layout.height * layout.length > _MOST_INFLATED * len(data):
-            raise ValueError("more pixels than the file has room for")
+            raise _DamagedError("more pixels than the file has room for")
         self.count = -(-layout.height // layout.rows)
         # Where each starts.
         self._table = memoryview(data)[layout.table : layout.table + 8 * self.count]
@@ -219,7 +226,7 @@ class _Chunks:
         top = layout.top + first * layout.rows
         arguments = self._data, table, rows, top, layout.rows, layout.length
         if _unzip.unzip(self._inflate, *arguments) != count:
-            raise ValueError("a chunk is damaged, or missing")
+            raise _DamagedError("a chunk is damaged, or missing")
 
 
 def _by_bands(chunks: _Chunks, layout: _Layout) -> Iterator[tuple[slice, Bytes]]:

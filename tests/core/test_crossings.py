@@ -194,6 +194,18 @@ def test_a_state_of_another_size_is_not_written_to(part: int) -> None:
 
 
 @compiled
+def test_a_state_that_is_ahead_of_its_frames_reads_nothing_beyond_them() -> None:
+    state = state_of(7)
+    for part in state:
+        part[...] = np.iinfo(np.int32).max if part.dtype == np.int32 else 1
+    state[0][:], state[1][:], state[4][:] = 0x3800, 0x3C00, 0x3C00
+    frames = [np.full(7, 0x3C00, np.int16)] * 3 + [np.full(7, 0x3000, np.int16)]
+    before = [part.copy() for part in state]
+    _crossings.settle(state, frames, 3, 0, 0.96, 41)
+    assert np.array_equal(state[3], before[3])
+
+
+@compiled
 def test_what_is_no_array_is_refused() -> None:
     frames = [np.zeros(7, np.int16)] * 3
     for state, frame in (

@@ -284,3 +284,12 @@ def test_errors_that_are_understated_keep_no_plane_from_being_fitted() -> None:
     raised = said * np.float32(understated(value, said, PLANE))
     off, off_raised = (np.abs(fit_planes(value, e)[0] - SLOPED).mean() for e in (said, raised))
     assert off_raised < 0.5 * off
+
+
+@pytest.mark.parametrize("radii", [(1, 4), (4, 11, 28)])
+def test_errors_of_nothing_are_no_worse_than_small_ones(radii: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    value = (SLOPED + rng.normal(scale=0.1, size=SLOPED.shape)).astype(np.float32)
+    error = rng.choice([0, 0, 0.1, 1], SLOPED.shape).astype(np.float32)
+    fitted, spread = fit_planes(value, error, Windows(radii))
+    assert np.isfinite(fitted).all() and (spread >= 0).all()

@@ -341,3 +341,11 @@ def test_channels_out_of_order_are_left_to_openexr(tmp_path):
     data = encoded(tmp_path / "a.exr", {"X": one, "Y": 2 * one})
     assert scanlines.decode(data) is not None
     assert scanlines.decode(data.replace(b"X\0", b"Z\0", 1)) is None
+
+
+def test_what_goes_wrong_in_the_making_is_no_damage(plain):
+    def fail(red, green, blue, made):
+        raise ValueError("of its own")
+
+    with pytest.raises(ValueError, match="of its own"):
+        scanlines.decode(plain.read_bytes(), make=fail)

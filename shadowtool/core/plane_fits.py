@@ -41,6 +41,8 @@ _COMPANY = 3
 _LEVEL = 0.1
 # No plane is known better than this.
 _FLOOR = 0.02
+# Nor does a measurement weigh more than as of this variance: digits would not do for it and others.
+_LEAST_VARIANCE = 1e-6
 # From these radii on, windows are made of cells of so many pixels squared.
 _WIDE = {8: 2, 16: 4}
 # So many arrays of pixels are worked on together.
@@ -101,7 +103,7 @@ def fit_planes(
     measured, weight = (np.empty(value.shape) for _ in range(2))
     for rows in bands(value.shape):
         measured[rows] = np.where(known[rows], value[rows], np.float32(0))
-        weight[rows] = trusted[rows] / np.maximum(variance[rows], np.float32(1e-12))
+        weight[rows] = trusted[rows] / np.maximum(variance[rows], np.float32(_LEAST_VARIANCE))
     first, last, _ = wanted.indices(len(value))
     known, trusted, variance = known[wanted], trusted[wanted], variance[wanted]
     best = measured[wanted].astype(np.float32)
@@ -122,8 +124,7 @@ def fit_planes(
     found = known & np.isfinite(spread)
     best[~found] = np.nan
     spread[~found] = np.inf
-    # Of errors of next to nothing rounding leaves less.
-    return best, np.sqrt(np.maximum(spread, 0))
+    return best, np.sqrt(spread, out=spread)
 
 
 def _known(value: Float32, error: Float32) -> tuple[Bool, Float32]:
@@ -199,7 +200,7 @@ def understated(value: Float32, error: Float32, plane: Bool, windows: Windows = 
         part[:, 1:-1, 1:-1].reshape(len(part), -1).astype(np.float64) for part in (values, errors)
     )
     y, x = (part[1:-1, 1:-1].ravel() for part in (y, x))
-    weight = np.where(used, 1 / np.maximum(errors**2, 1e-12), 0)
+    weight = np.where(used, 1 / np.maximum(errors**2, _LEAST_VARIANCE), 0)
     measured = np.where(used, values, 0)
     terms = np.stack([np.ones(len(x)), x / radius, y / radius], axis=-1)
     normal = np.einsum("nk,ki,kj->nij", weight, terms, terms) + 1e-6 * np.eye(3)
@@ -299,7 +300,7 @@ def _choose(fitted: _Fitted, first: int, chosen: _Choice) -> None:
         first: the row among those fitted that is the first of the choice.
     """
     # And with what smaller windows told.
-    allowed = np.sqrt(np.maximum(chosen.variance, 0))
+    allowed = np.sqrt(chosen.variance)
     allowed *= np.float32(_AGREES)
     least = np.maximum(chosen.least, chosen.value - allowed)
     most = np.minimum(chosen.most, chosen.value + allowed)

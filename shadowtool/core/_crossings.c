@@ -154,8 +154,7 @@ static void look(const state_t *state, const pass_t *pass, Py_ssize_t pixel, int
     }
 }
 
-/* Lowest and highest of some pixels with the new frames, and the lowest without the last of them.
- */
+/* Some pixels' lowest and highest with the new frames, and the lowest without the last of them. */
 static void extremes(const pass_t *pass, Py_ssize_t start, Py_ssize_t count, int16_t *lower,
                      int16_t *low, int16_t *high)
 {

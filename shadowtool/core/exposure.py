@@ -139,7 +139,8 @@ def clipped_part(samples: Sequence[Float32], top: float | None) -> float:
     Clipped light is the most that there is, in most frames, and does not scatter.
 
     Args:
-        samples: (h, w, 3) each, a few frames as they were shot, linear light.
+        samples: (h, w, 3) each, a few frames, linear light; not finite unknown. Those of which
+            another exposure was taken out have another top, and count as below it or above.
         top: the most that the files can hold; None if they have no such bound, as floats: then a
             plateau counts, if light elsewhere scatters.
 

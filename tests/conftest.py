@@ -172,3 +172,15 @@ def narrow_bands(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
             monkeypatch.setattr(f"shadowtool.core.{name}", 1000)
 
     return narrow
+
+
+def write_sum(red: np.ndarray, green: np.ndarray, blue: np.ndarray, made: np.ndarray) -> None:
+    """Something to be made of a picture's channels."""
+    made[:] = red + 2 * green + 4 * blue
+
+
+def sum_of(*channels: np.ndarray) -> np.ndarray:
+    """What `write_sum` writes of three channels (H, W)."""
+    made = np.empty(channels[0].shape, np.float16)
+    write_sum(*channels, made)
+    return made

@@ -35,6 +35,7 @@ from shadowtool.io.image import (
     write_exr,
     write_png,
 )
+from tests.conftest import sum_of, write_sum
 
 TIME_CODE = OpenEXR.TimeCode(1, 2, 3, 4, *[False] * 6, *[0] * 8)
 
@@ -586,16 +587,6 @@ def test_colours_of_other_pictures_are_those_of_rgb(tmp_path, png):
     for path in (grey, layer, png):
         image = read_image(path, apart=True)
         np.testing.assert_array_equal(np.stack(image.colours(), axis=-1), image.rgb())
-
-
-def write_sum(red, green, blue, made):
-    made[:] = red + 2 * green + 4 * blue
-
-
-def sum_of(*channels):
-    made = np.empty(channels[0].shape, np.float16)
-    write_sum(*channels, made)
-    return made
 
 
 @pytest.mark.parametrize("types", ["eff", "eee", "fff", "III"])

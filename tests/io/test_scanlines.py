@@ -20,6 +20,7 @@ from shadowtool.errors import ShadowtoolError
 from shadowtool.io import scanlines
 from shadowtool.io.image import read_image
 from shadowtool.io.openexr_core import inflating
+from tests.conftest import sum_of, write_sum
 
 _unzip = scanlines._unzip
 pytestmark = pytest.mark.skipif(_unzip is None, reason="it was installed without a compiler")
@@ -106,16 +107,6 @@ def test_colour_with_something_beside_it_is_left_apart(tmp_path):
     found = scanlines.decode(encoded(tmp_path / "a.exr", dict.fromkeys("RGBZ", one)))
     assert found is not None
     assert sorted(found) == ["B", "G", "R", "Z"]
-
-
-def write_sum(red, green, blue, made):
-    made[:] = red + 2 * green + 4 * blue
-
-
-def sum_of(*channels):
-    made = np.empty(channels[0].shape, np.float16)
-    write_sum(*channels, made)
-    return made
 
 
 @pytest.mark.parametrize("kinds", ["eee", "fff", "efI"])

@@ -223,19 +223,23 @@ def _agreed(ratios: Float32) -> float | None:
     agreed = near[np.abs(near - centre) < _NEAR[0]]
     # What agrees is many, and many more than if the ratios were anything at all.
     enough = max(_LEAST_PART * ratios.size, 2 * near.size * _NEAR[0] / _WIDEST)
-    return None if agreed.size < enough else _closed_in(near, centre)
+    return None if agreed.size < enough else _closed_in(np.sort(near), centre)
 
 
-def _closed_in(ratios: Float32, centre: float, spread: float = 0.0) -> float:
-    """The middle of those near the centre; no nearer than they scatter."""
-    ordered = np.sort(ratios)
+def _closed_in(ordered: Float32, centre: float, spread: float = 0.0) -> float:
+    """The middle of those ratios near the centre, of ratios in order; no nearer than they
+    scatter."""
     for width in _NEAR:
         reach = max(width, spread)
         first, last = np.searchsorted(ordered, (centre - reach, centre + reach))
-        # Their median, as they are in order.
-        middle = ordered[(first + last - 1) // 2 : (first + last) // 2 + 1]
-        centre = float(middle.mean()) if last > first else centre
+        centre = _middle(ordered[first:last]) if last > first else centre
     return centre
+
+
+def _middle(ordered: Float32) -> float:
+    """The median of what is in order."""
+    count = len(ordered)
+    return float(ordered[(count - 1) // 2 : count // 2 + 1].mean())
 
 
 def sampled_areas(gray: NDArray[np.floating]) -> Float32:
@@ -273,20 +277,20 @@ class RunningGain:
         if self._first is None or self._last is None:
             self._first = self._last = gray
             return 1.0
-        changes = _ratios(gray, self._last)
+        changes = np.sort(_ratios(gray, self._last))
         if not changes.size:
             return self._gain()
-        middle = float(median(changes))
+        middle = _middle(changes)
         # Of a picture that a shadow leaves all but black nothing can be told.
         agreed = np.count_nonzero(np.abs(changes - middle) < _NEAR[0])
         if agreed < max(_LEAST_PART * gray.size, _LEAST_PIXELS):
             return self._gain()
-        spread = 1.48 * float(median(np.abs(changes - middle)))
+        spread = 1.48 * float(np.median(np.abs(changes - middle)))
         expected = self._logarithm + _closed_in(changes, middle, spread)
         ratios = _ratios(gray, self._first)
         same = np.abs(ratios - expected) < max(_NEAR[0], spread)
         if same.sum() >= max(_LEAST_PART * ratios.size, _LEAST_PIXELS):
-            expected = _closed_in(ratios, expected, spread)
+            expected = _closed_in(np.sort(ratios), expected, spread)
         self._logarithm, self._last = expected, gray
         return self._gain()
 

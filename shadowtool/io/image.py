@@ -47,8 +47,8 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _ATTRIBUTE = "shadowtool."
 # Of a grey picture R, G and B differ by no more than this, which rounding explains.
 _COLOURED = 1 / 32
-# ZIP levels: the library's own, and the least that compresses.
-_USUAL, _QUICK = -1, 1
+# ZIP levels: OpenEXR's own, and the least that compresses.
+_USUAL, _QUICK = 4, 1
 # What OpenEXR raises for headers that make no sense; ZeroDivisionError is a rational number's.
 _EXR_FAULTS = (RuntimeError, ValueError, TypeError, ArithmeticError)
 
@@ -257,6 +257,17 @@ def _joined(channels: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return cv2.merge(whole).view(kind)
 
 
+def _apart(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Each channel (H, W) by its own name."""
+    channels = {}
+    for name, values in arrays.items():
+        if values.ndim == 2:
+            channels[name] = values
+        else:
+            channels |= {letter: values[..., index] for index, letter in enumerate(name)}
+    return channels
+
+
 def _one_channel(values: NDArray[Any], index: int) -> NDArray[Any]:
     """(H, W) of (H, W, C)."""
     return cv2.extractChannel(_for_opencv(values), index).view(values.dtype)
@@ -402,14 +413,15 @@ def encode_exr(
             raise TypeError(f"channel {name} of {path} is {values.dtype}, not half or float")
         arrays[name] = np.ascontiguousarray(values)
     height, width = next(iter(arrays.values())).shape[:2]
+    first = np.array((0, 0) if header is None else header.origin, np.int32)
+    window = first, first + np.array([width - 1, height - 1], np.int32)
     attributes: dict[str, Any] = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
+        "displayWindow": window,
+        "dataWindow": window,
     }
     if header is not None:
-        first = np.array(header.origin, np.int32)
-        last = first + np.array([width - 1, height - 1], np.int32)
-        attributes["displayWindow"] = attributes["dataWindow"] = (first, last)
         attributes["pixelAspectRatio"] = header.pixel_aspect
         if header.frame_rate is not None:
             attributes["framesPerSecond"] = header.frame_rate
@@ -417,13 +429,30 @@ def encode_exr(
             attributes["timeCode"] = header.time_code
     for key, value in (provenance or {}).items():
         attributes[_ATTRIBUTE + key] = value.encode("utf-8", "replace").decode()
-    buffer = io.BytesIO()
+    level = _QUICK if quick else _USUAL
     try:
-        with _zip_level.at(_QUICK if quick else _USUAL):
-            OpenEXR.File(attributes, arrays).write(buffer)
-    except RuntimeError as error:
+        if scanlines.encodes():
+            head = bytes(_one_pixel(attributes, arrays))
+            encoded = scanlines.encode(head, _apart(arrays), level)
+            if encoded is not None:
+                return encoded
+        with _zip_level.at(level):
+            return _encoded(attributes, arrays)
+    except (RuntimeError, MemoryError) as error:
         # Arrays are as they have to be: what fails is memory.
         raise RetryError(f"{path}: cannot be encoded: {error}; give a smaller --jobs") from None
+
+
+def _one_pixel(attributes: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> memoryview:
+    """A file with the header of a whole one, and a data window that ends where it starts."""
+    corner, _ = attributes["dataWindow"]
+    pixels = {name: np.ascontiguousarray(values[:1, :1]) for name, values in arrays.items()}
+    return _encoded(dict(attributes) | {"dataWindow": (corner, corner)}, pixels)
+
+
+def _encoded(attributes: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> memoryview:
+    buffer = io.BytesIO()
+    OpenEXR.File(dict(attributes), dict(arrays)).write(buffer)
     return buffer.getbuffer()
 
 
@@ -435,7 +464,8 @@ class _ZipLevel:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._now, self._writers = _USUAL, 0
+        self._now: int | None = None
+        self._writers = 0
 
     @contextlib.contextmanager
     def at(self, level: int) -> Iterator[None]:

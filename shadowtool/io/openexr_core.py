@@ -17,7 +17,16 @@ def set_zip_level(level: int) -> None:
 
 def inflating() -> int | None:
     """The address of ``exr_uncompress_buffer``; None where a build hides it."""
-    return ctypes.cast(_function("exr_uncompress_buffer"), ctypes.c_void_p).value
+    return _address("exr_uncompress_buffer")
+
+
+def deflating() -> int | None:
+    """The address of ``exr_compress_buffer``; None where a build hides it."""
+    return _address("exr_compress_buffer")
+
+
+def _address(name: str) -> int | None:
+    return ctypes.cast(_function(name), ctypes.c_void_p).value
 
 
 def _function(name: str) -> Any:

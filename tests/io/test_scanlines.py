@@ -1,4 +1,4 @@
-"""EXR scanlines decoded here: as OpenEXR decodes them, or not at all."""
+"""EXR scanlines decoded and encoded here: as OpenEXR does it, or not at all."""
 
 import contextlib
 import os
@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 
 from shadowtool.errors import ShadowtoolError
 from shadowtool.io import scanlines
-from shadowtool.io.image import read_image
-from shadowtool.io.openexr_core import inflating
+from shadowtool.io.image import Header, encode_exr, read_image
+from shadowtool.io.openexr_core import deflating, inflating
 from tests.conftest import sum_of, write_sum
 
-_unzip = scanlines._unzip
-pytestmark = pytest.mark.skipif(_unzip is None, reason="it was installed without a compiler")
+_zip = scanlines._zip
+pytestmark = pytest.mark.skipif(_zip is None, reason="it was installed without a compiler")
 
 KINDS = {"e": np.float16, "f": np.float32, "I": np.uint32}
 NONE, ZIPS, ZIP = OpenEXR.NO_COMPRESSION, OpenEXR.ZIPS_COMPRESSION, OpenEXR.ZIP_COMPRESSION
@@ -184,11 +184,11 @@ def test_a_file_cut_off_anywhere_is_not_decoded(plain):
 @contextlib.contextmanager
 def left_to_openexr() -> Iterator[None]:
     """As where no compiler was there."""
-    here, scanlines._unzip = scanlines._unzip, None
+    here, scanlines._zip = scanlines._zip, None
     try:
         yield
     finally:
-        scanlines._unzip = here
+        scanlines._zip = here
 
 
 def outcome(path: Path) -> Any:
@@ -226,6 +226,59 @@ def test_without_a_compiler_everything_is_left_to_openexr(plain):
         assert outcome(plain) == expected
 
 
+@given(
+    size=st.tuples(st.integers(1, 70), st.integers(1, 40)),
+    names=st.sets(st.sampled_from(["RGB", "A", "Y", "confidence", "Z"]), min_size=1),
+    kinds=st.lists(st.sampled_from("ef"), min_size=5, max_size=5),
+    corner=st.tuples(st.integers(-70, 70), st.integers(-70, 70)),
+    levels=st.sampled_from([1, 3, 1 << 15]),
+    quick=st.booleans(),
+    seed=st.integers(0, 99),
+)
+def test_a_file_is_openexrs_to_the_last_bit(size, names, kinds, corner, levels, quick, seed):
+    rng = np.random.default_rng(seed)
+    arrays = {}
+    for name, kind in zip(sorted(names), kinds, strict=False):
+        shape = (*size, len(name)) if name == "RGB" else size
+        arrays[name] = rng.integers(0, levels, shape).astype(KINDS[kind])
+    arguments = Path("a.exr"), arrays, Header(*size[::-1], corner), {"command": "é"}, quick
+    with left_to_openexr():
+        assert not scanlines.encodes()
+        expected = bytes(encode_exr(*arguments))
+    assert scanlines.encodes()
+    assert bytes(encode_exr(*arguments)) == expected
+
+
+def test_some_rows_at_a_time_are_encoded_as_all_are(few_rows):
+    pixels = np.random.default_rng(1).integers(0, 90, (200, 21, 4)).astype("f2")
+    with left_to_openexr():
+        expected = bytes(encode_exr(Path("a.exr"), {"RGBA": pixels}))
+    assert bytes(encode_exr(Path("a.exr"), {"RGBA": pixels})) == expected
+
+
+def one_pixel(path: Path, **channels: np.ndarray) -> bytes:
+    return encoded(path, {name: values[:1, :1].copy() for name, values in channels.items()})
+
+
+def test_what_is_not_decoded_is_not_encoded(tmp_path):
+    channels = {"r": np.ones((3, 4), np.float16)}
+    assert scanlines.encode(one_pixel(tmp_path / "a.exr", **channels), channels, 4) is None
+    channels = {"R": channels["r"]}
+    head = one_pixel(tmp_path / "a.exr", **channels)
+    assert scanlines.encode(head, channels, 4) is not None
+    assert scanlines.encode(head[:50], channels, 4) is None
+
+
+def test_an_openexr_that_hides_its_deflating_does_it_all(tmp_path, monkeypatch):
+    pixels = np.random.default_rng(1).integers(0, 90, (20, 21, 3)).astype("f2")
+    expected = bytes(encode_exr(Path("a.exr"), {"RGB": pixels}))
+    (tmp_path / "none").touch()
+    monkeypatch.setattr(OpenEXR, "__file__", os.fspath(tmp_path / "none"))
+    assert deflating() is None
+    assert not scanlines.encodes()
+    assert bytes(encode_exr(Path("a.exr"), {"RGB": pixels})) == expected
+
+
 def test_an_openexr_that_hides_its_inflating_does_it_all(plain, monkeypatch):
     expected = outcome(plain)
     monkeypatch.setattr(OpenEXR, "__file__", os.fspath(plain))
@@ -257,7 +310,7 @@ def test_a_chunk_of_any_size_is_put_in_order(size):
     target = np.zeros(size, np.uint8)
     inflate = inflating()
     assert inflate is not None
-    assert _unzip.unzip(inflate, chunk(7, stored), table(0), target, 7, 1, size) == 1
+    assert _zip.unzip(inflate, chunk(7, stored), table(0), target, 7, 1, size) == 1
     assert target.tobytes() == rows
 
 
@@ -265,31 +318,31 @@ def test_a_chunk_of_any_size_is_put_in_order(size):
 def test_a_chunk_that_is_not_where_it_should_be_is_not_taken(place):
     data = chunk(0, b"1234") + chunk(2, b"5678")[:-1]
     target = np.zeros(16, np.uint8)
-    assert _unzip.unzip(0, data, table(0, place), target, 0, 2, 2) == 1
+    assert _zip.unzip(0, data, table(0, place), target, 0, 2, 2) == 1
     assert target.tobytes() == b"1234" + bytes(12)
 
 
 @pytest.mark.parametrize("number, stored", [(1, 4), (0, 0), (0, -4), (0, 5), (0, 2**31 - 1)])
 def test_a_chunk_that_says_something_else_of_itself_is_not_taken(number, stored):
     data = struct.pack("<ii", number, stored) + b"1234"
-    assert _unzip.unzip(0, data, table(0), np.zeros(4, np.uint8), 0, 1, 4) == 0
-    assert _unzip.unzip(0, chunk(0, b"1234"), table(0), np.zeros(4, np.uint8), 0, 1, 4) == 1
+    assert _zip.unzip(0, data, table(0), np.zeros(4, np.uint8), 0, 1, 4) == 0
+    assert _zip.unzip(0, chunk(0, b"1234"), table(0), np.zeros(4, np.uint8), 0, 1, 4) == 1
 
 
 @pytest.mark.parametrize("length", range(8))
 def test_a_file_shorter_than_a_chunk_begins_has_none(length):
-    assert _unzip.unzip(0, bytes(length), table(0), np.zeros(4, np.uint8), 0, 1, 4) == 0
+    assert _zip.unzip(0, bytes(length), table(0), np.zeros(4, np.uint8), 0, 1, 4) == 0
 
 
 def test_chunks_for_which_there_is_no_room_are_not_taken():
     memory = np.full(8, 7, np.uint8)
     data = b"".join(chunk(number, b"12") for number in range(9))
     places = table(*range(0, 90, 10))
-    assert _unzip.unzip(0, data, places, memory[:3], 0, 1, 2) == 1
+    assert _zip.unzip(0, data, places, memory[:3], 0, 1, 2) == 1
     assert memory.tobytes() == b"12" + bytes([7] * 6)
     # The last one is what is left.
     data = chunk(0, b"12") + chunk(1, b"3")
-    assert _unzip.unzip(0, data, table(0, 10), memory[:3], 0, 1, 2) == 2
+    assert _zip.unzip(0, data, table(0, 10), memory[:3], 0, 1, 2) == 2
     assert memory.tobytes() == b"123" + bytes([7] * 5)
 
 
@@ -299,13 +352,54 @@ def test_what_inflates_to_more_or_less_is_damaged():
     stored = chunk(0, zlib.compress(bytes(100)))
     for size, done in ((99, 0), (100, 1), (101, 0)):
         memory = np.zeros(size, np.uint8)
-        assert _unzip.unzip(inflate, stored, table(0), memory, 0, 1, size) == done
+        assert _zip.unzip(inflate, stored, table(0), memory, 0, 1, size) == done
 
 
 @pytest.mark.parametrize("rows, length", [(0, 4), (4, 0), (-1, 4), (4, -1)])
 def test_chunks_of_nothing_are_an_error(rows, length):
     with pytest.raises(ValueError, match="without"):
-        _unzip.unzip(0, b"", table(), np.zeros(4, np.uint8), 0, rows, length)
+        _zip.unzip(0, b"", table(), np.zeros(4, np.uint8), 0, rows, length)
+
+
+@pytest.mark.parametrize("size", [*range(1, 70), 1000, 1001])
+def test_a_chunk_of_any_size_is_deflated_in_order(size):
+    rows = np.random.default_rng(size).integers(0, 4, size, np.uint8)
+    deflate = deflating()
+    assert deflate is not None
+    target, places = np.zeros(2 * size + 300, np.uint8), np.zeros(1, np.uint64)
+    end = _zip.zip(deflate, 9, rows, target, 5, places, 7, 1, size)
+    assert places[0] == 5
+    number, stored = struct.unpack_from("<ii", target, 5)
+    assert (number, end) == (7, 13 + stored)
+    data = target[13:end].tobytes()
+    if stored == size:
+        assert data == rows.tobytes()
+    else:
+        assert zlib.decompress(data) == predicted(rows.tobytes())
+    assert not target[end + 256 :].any()
+
+
+@pytest.mark.parametrize("room", [0, 7, 8, 100, 1007, 1008])
+def test_chunks_for_which_there_is_no_room_are_not_deflated(room):
+    deflate = deflating()
+    assert deflate is not None
+    rows = np.random.default_rng(1).integers(0, 256, 1000, np.uint8)
+    memory, places = np.full(1100, 7, np.uint8), np.zeros(1, np.uint64)
+    assert _zip.zip(deflate, 4, rows, memory[:room], 0, places, 0, 1, 1000) == -1
+    assert (memory[room:] == 7).all()
+
+
+@pytest.mark.parametrize("place", [-1, 9, 1 << 62])
+def test_a_place_outside_the_target_is_an_error(place):
+    deflate = deflating()
+    assert deflate is not None
+    rows, target, places = np.zeros(4, np.uint8), np.zeros(8, np.uint8), np.zeros(1, np.uint64)
+    with pytest.raises(ValueError, match="no place"):
+        _zip.zip(deflate, 4, rows, target, place, places, 0, 1, 4)
+    with pytest.raises(ValueError, match="nothing that deflates"):
+        _zip.zip(0, 4, rows, target, 0, places, 0, 1, 4)
+    with pytest.raises(ValueError, match="without"):
+        _zip.zip(deflate, 4, rows, target, 0, places, 0, 0, 4)
 
 
 def test_an_attribute_that_stands_there_twice_is_left_to_openexr(plain):

@@ -1,9 +1,9 @@
-/* Undoes OpenEXR's ZIP for all chunks of a picture, without Python in between.
+/* OpenEXR's ZIP, done and undone for many chunks of a picture, without Python in between.
  *
  * Before a chunk is deflated its bytes are sorted, those at even places before those at odd ones,
  * and each but the first is stored as its difference to the one before, plus 128. To add them up
- * again is a running sum of bytes, for which numpy has no fast way, and which OpenEXR as it is
- * built for Python does byte by byte.
+ * again is a running sum of bytes, for which numpy has no fast way. OpenEXR as it is built for
+ * Python goes byte by byte, both ways.
  */
 
 #define PY_SSIZE_T_CLEAN
@@ -126,6 +126,72 @@ static Py_ssize_t unzip(inflate_t inflate, const Py_buffer *data, const Py_buffe
     return chunk;
 }
 
+/* The bytes of a chunk as they are deflated: sorted, and but for the first as differences. */
+static void arrange(const uint8_t *bytes, uint8_t *sorted, Py_ssize_t size)
+{
+    Py_ssize_t pairs = size / 2, at;
+    uint8_t *even = sorted, *odd = sorted + (size + 1) / 2;
+    for (at = 1; at < pairs; at++) {
+        even[at] = (uint8_t)(bytes[2 * at] - bytes[2 * at - 2] + 128);
+        odd[at] = (uint8_t)(bytes[2 * at + 1] - bytes[2 * at - 1] + 128);
+    }
+    if (size % 2 && size > 1)
+        even[pairs] = (uint8_t)(bytes[size - 1] - bytes[size - 3] + 128);
+    even[0] = bytes[0];
+    if (pairs)
+        odd[0] = (uint8_t)(bytes[1] - bytes[size - 1 - (size + 1) % 2] + 128);
+}
+
+/* OpenEXR's exr_compress_buffer: context, level, source, target, and how much came of it. */
+typedef int32_t (*deflate_t)(const void *, int, const void *, size_t, void *, size_t, size_t *);
+
+/* Deflate rows, and note where in the target each chunk starts: the end of the last; -1 if it could
+ * not be done. What deflating makes no smaller is stored as it is. */
+static Py_ssize_t zip(deflate_t deflate, int level, const Py_buffer *source, Py_buffer *target,
+                      Py_ssize_t place, Py_buffer *table, const layout_t *layout, uint8_t *scratch)
+{
+    const uint8_t *rows = source->buf;
+    uint8_t *file = target->buf;
+    Py_ssize_t chunks = table->len / 8, size = layout->rows * layout->length, chunk;
+    for (chunk = 0; chunk < chunks && chunk * size < source->len; chunk++) {
+        Py_ssize_t left = source->len - chunk * size, own = left < size ? left : size;
+        uint64_t start = (uint64_t)place;
+        int32_t number = (int32_t)(layout->top + chunk * layout->rows), stored = (int32_t)own;
+        size_t deflated = 0;
+        if (target->len - place < 8 + own)
+            return -1;
+        arrange(rows + chunk * size, scratch, own);
+        place += 8;
+        if (deflate(NULL, level, scratch, (size_t)own, file + place,
+                    (size_t)(target->len - place), &deflated))
+            return -1;
+        if (deflated < (size_t)own)
+            stored = (int32_t)deflated;
+        else
+            memcpy(file + place, rows + chunk * size, (size_t)own);
+        memcpy((uint8_t *)table->buf + 8 * chunk, &start, 8);
+        memcpy(file + start, &number, 4);
+        memcpy(file + start + 4, &stored, 4);
+        place += stored;
+    }
+    return place;
+}
+
+/* Room for a chunk, or for as much of one as there is; NULL with an error set. */
+static uint8_t *room_for(const layout_t *layout, Py_ssize_t there)
+{
+    if (layout->rows < 1 || layout->length < 1) {
+        PyErr_SetString(PyExc_ValueError, "chunks without rows, or rows without bytes");
+        return NULL;
+    }
+    Py_ssize_t size = layout->rows * layout->length;
+    /* One byte more, as of nothing there may be no memory. */
+    uint8_t *room = malloc((size_t)(size < there ? size : there) + 1);
+    if (!room)
+        PyErr_NoMemory();
+    return room;
+}
+
 static PyObject *py_unzip(PyObject *module, PyObject *arguments)
 {
     PyObject *address;
@@ -137,17 +203,8 @@ static PyObject *py_unzip(PyObject *module, PyObject *arguments)
                           &layout.top, &layout.rows, &layout.length))
         return NULL;
     inflate_t inflate = (inflate_t)PyLong_AsVoidPtr(address);
-    uint8_t *scratch = NULL;
-    if (!PyErr_Occurred() && (layout.rows < 1 || layout.length < 1))
-        PyErr_SetString(PyExc_ValueError, "chunks without rows, or rows without bytes");
-    if (!PyErr_Occurred()) {
-        Py_ssize_t size = layout.rows * layout.length;
-        /* One byte more, as of nothing there may be no memory. */
-        scratch = malloc((size_t)(size < target.len ? size : target.len) + 1);
-        if (!scratch)
-            PyErr_NoMemory();
-    }
-    if (!PyErr_Occurred()) {
+    uint8_t *scratch = PyErr_Occurred() ? NULL : room_for(&layout, target.len);
+    if (scratch) {
         Py_BEGIN_ALLOW_THREADS
         done = unzip(inflate, &data, &table, &target, &layout, scratch);
         Py_END_ALLOW_THREADS
@@ -159,6 +216,35 @@ static PyObject *py_unzip(PyObject *module, PyObject *arguments)
     return PyErr_Occurred() ? NULL : PyLong_FromSsize_t(done);
 }
 
+static PyObject *py_zip(PyObject *module, PyObject *arguments)
+{
+    PyObject *address;
+    Py_buffer rows, target, table;
+    layout_t layout;
+    Py_ssize_t place, end = 0;
+    int level;
+    (void)module;
+    if (!PyArg_ParseTuple(arguments, "O!iy*w*nw*inn", &PyLong_Type, &address, &level, &rows,
+                          &target, &place, &table, &layout.top, &layout.rows, &layout.length))
+        return NULL;
+    deflate_t deflate = (deflate_t)PyLong_AsVoidPtr(address);
+    uint8_t *scratch = PyErr_Occurred() ? NULL : room_for(&layout, rows.len);
+    if (scratch) {
+        if (deflate && place >= 0 && place <= target.len) {
+            Py_BEGIN_ALLOW_THREADS
+            end = zip(deflate, level, &rows, &target, place, &table, &layout, scratch);
+            Py_END_ALLOW_THREADS
+        } else {
+            PyErr_SetString(PyExc_ValueError, "nothing that deflates, or no place in the target");
+        }
+    }
+    free(scratch);
+    PyBuffer_Release(&rows);
+    PyBuffer_Release(&target);
+    PyBuffer_Release(&table);
+    return PyErr_Occurred() ? NULL : PyLong_FromSsize_t(end);
+}
+
 static PyMethodDef methods[] = {
     {"unzip", py_unzip, METH_VARARGS,
      "unzip(inflate, data, table, target, top, rows, length): how many chunks from the first on\n"
@@ -166,14 +252,20 @@ static PyMethodDef methods[] = {
      "inflate is the address of OpenEXR's exr_uncompress_buffer, or 0 for chunks that are stored\n"
      "as they are; table holds each one's place in data as uint64. Into target go rows of so many\n"
      "bytes, so many of them from each chunk; the first has the number top."},
+    {"zip", py_zip, METH_VARARGS,
+     "zip(deflate, level, source, target, place, table, top, rows, length): the place after the\n"
+     "last chunk, -1 if target has no room for them, or there is no memory.\n\n"
+     "deflate is the address of OpenEXR's exr_compress_buffer. source holds rows of so many bytes,\n"
+     "of which so many go to each chunk; the first has the number top. Chunks are written to target\n"
+     "from a place on, and where each starts to table, as uint64."},
     {NULL, NULL, 0, NULL},
 };
 
 static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, "_unzip", NULL, 0, methods, NULL, NULL, NULL, NULL,
+    PyModuleDef_HEAD_INIT, "_zip", NULL, 0, methods, NULL, NULL, NULL, NULL,
 };
 
-PyMODINIT_FUNC PyInit__unzip(void)
+PyMODINIT_FUNC PyInit__zip(void)
 {
     return PyModule_Create(&definition);
 }

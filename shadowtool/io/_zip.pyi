@@ -11,3 +11,14 @@ def unzip(
     rows: int,
     length: int,
 ) -> int: ...
+def zip(
+    deflate: int,
+    level: int,
+    source: NDArray[Any],
+    target: NDArray[Any],
+    place: int,
+    table: NDArray[Any],
+    top: int,
+    rows: int,
+    length: int,
+) -> int: ...

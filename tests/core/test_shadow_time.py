@@ -1,7 +1,10 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from shadowtool.core import shadow_time
 from shadowtool.core.crossings import CrossingFinder, Crossings
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.shadow_time import (
@@ -9,6 +12,7 @@ from shadowtool.core.shadow_time import (
     SHADE,
     interpolated_times,
     luminance,
+    luminance_halfs,
     misled,
     own_times,
     refined_times,
@@ -43,6 +47,45 @@ def sweep_frames(sweep: Sweep, noise: float = 0.0) -> list[np.ndarray]:
 def true_times(sweep: Sweep) -> np.ndarray:
     normal, offset = SCENE.edge(sweep, 0)
     return (SCENE.warp @ normal + offset) / sweep.speed
+
+
+def in_numpy(*channels: np.ndarray) -> np.ndarray:
+    """As where no compiler was there."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shadow_time, "_luminance", None)
+        return luminance_halfs(*channels)
+
+
+@given(st.integers(1, 5), st.integers(1, 40), st.integers(0, 3), st.integers(0, 999))
+@pytest.mark.filterwarnings("ignore:invalid value", "ignore:overflow")
+def test_luminance_of_any_halfs_is_the_same_bits_compiled_or_not(height, width, apart, seed):
+    bits = np.random.default_rng(seed).integers(0, 1 << 16, (3, height, width + apart), np.uint16)
+    channels = bits.view(np.float16)[..., :width]
+    expected, found = in_numpy(*channels), luminance_halfs(*channels)
+    same = expected.view(np.uint16) == found.view(np.uint16)
+    assert (same | (np.isnan(expected) & np.isnan(found))).all()
+
+
+@pytest.mark.parametrize("kinds", ["eee", "fff", "efe"])
+def test_luminance_is_rounded_to_halfs_once(kinds):
+    rng = np.random.default_rng(1)
+    channels = [rng.uniform(0, 9, (30, 50)).astype("f2").astype(kind) for kind in kinds]
+    expected = luminance(np.stack(channels, axis=-1).astype(np.float32))
+    for made in (luminance_halfs, in_numpy):
+        off = np.abs(made(*channels).astype(np.float32) - expected)
+        assert (off <= np.spacing(expected.astype(np.float16)) * 0.501).all()
+
+
+@pytest.mark.skipif(shadow_time._luminance is None, reason="it was installed without a compiler")
+def test_the_compiled_luminance_takes_nothing_but_rows_of_halfs():
+    halfs = np.ones((4, 6), np.float16)
+    for wrong in (halfs[:, :5], halfs[:3], halfs[:, ::2], halfs.astype("f4"), halfs.ravel()):
+        with pytest.raises(ValueError, match="no rows of halfs"):
+            shadow_time._luminance.luminance(halfs, halfs, wrong, halfs.copy(), 1, 1, 1)
+    frozen = halfs.copy()
+    frozen.flags.writeable = False
+    with pytest.raises(ValueError, match="read-only"):
+        shadow_time._luminance.luminance(halfs, halfs, halfs, frozen, 1, 1, 1)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.8, 2.0, 3.5, 5.5])

@@ -16,6 +16,12 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import bands
 
+try:
+    from shadowtool.core import _planes as _compiled
+except ImportError:
+    # No compiler was there when this was installed.
+    _compiled = None  # type: ignore[assignment]
+
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -299,14 +305,17 @@ def _choose(fitted: _Fitted, first: int, chosen: _Choice) -> None:
     Args:
         first: the row among those fitted that is the first of the choice.
     """
+    planes, height, size, cells = fitted
+    radius = size * cells
+    if _compiled is not None:
+        _compiled.choose(planes, chosen, height, size, radius, first, _AGREES)
+        return
     # And with what smaller windows told.
     allowed = np.sqrt(chosen.variance)
     allowed *= np.float32(_AGREES)
     least = np.maximum(chosen.least, chosen.value - allowed)
     most = np.minimum(chosen.most, chosen.value + allowed)
     best, spread, _, _ = chosen
-    planes, height, size, cells = fitted
-    radius = size * cells
     shape, rows = (height, best.shape[1]), slice(first, first + len(best))
     # From the middle of a cell, in radii, as planes are.
     offsets = (np.arange(size, dtype=np.float32)[:, np.newaxis] - (size - 1) / 2) / radius
@@ -346,7 +355,7 @@ def _planes(value: Float64, weight: Float64, size: int, cells: int, factor: floa
         offsets = ((np.arange(width) % size - (size - 1) / 2) / (size * cells)).astype(np.float32)
         wide = (sums[0].shape[1] * size, sums[0].shape[0])
         parts = (cv2.resize(part, wide, interpolation=cv2.INTER_NEAREST) for part in planes)
-        columns = (np.asarray(part[:, :width], np.float32) for part in parts)
+        columns = (np.ascontiguousarray(part[:, :width], np.float32) for part in parts)
         planes = _Planes(*columns).from_column(offsets)
     return _Fitted(planes, height, size, cells)
 

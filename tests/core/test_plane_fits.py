@@ -5,9 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shadowtool.core import plane_fits
 from shadowtool.core.plane_fits import RADII, Windows, fit_planes, understated
 
 REACH = Windows().reach
+compiled = pytest.mark.skipif(
+    plane_fits._compiled is None, reason="it was installed without a compiler"
+)
 ROWS, COLUMNS = np.mgrid[:60, :80].astype(np.float64)
 
 
@@ -236,6 +240,61 @@ def test_any_picture_gives_one_of_its_size(
     assert np.isnan(fitted[np.isnan(value)]).all()
     assert np.array_equal(np.isfinite(fitted), np.isfinite(spread))
     assert (spread > 0).all()
+
+
+@compiled
+@settings(max_examples=100, deadline=None)
+@given(
+    st.integers(1, 90),
+    st.integers(1, 90),
+    st.sampled_from([Windows(), Windows((2,)), Windows((9, 20)), Windows((15, 40), near=30.0)]),
+    st.sampled_from([0.0, 0.3, 0.9]),
+    st.integers(0, 2**32 - 1),
+)
+def test_compiled_or_not_the_same_bits_are_fitted(
+    height: int, width: int, windows: Windows, unknown: float, seed: int
+) -> None:
+    """Planes and steps, errors of all sizes, of nothing too."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    value = (0.1 * y - 0.07 * x + 20 * (x > rng.integers(width))).astype(np.float32)
+    error = rng.choice([0.0, 0.01, 0.3, 5.0], value.shape).astype(np.float32)
+    value += error * rng.normal(size=value.shape).astype(np.float32)
+    value[rng.random(value.shape) < unknown] = np.nan
+    start = int(rng.integers(height))
+    wanted = slice(start, int(rng.integers(start, height)) + 1)
+    found = fit_planes(value, error, windows, wanted)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plane_fits, "_compiled", None)
+        expected = fit_planes(value, error, windows, wanted)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@compiled
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"planes": 8},
+        {"cells": 2},
+        {"width": 6},
+        {"kind": "f8"},
+        {"size": 0},
+        {"radius": 0},
+        {"height": -1},
+    ],
+)
+def test_what_does_not_fit_together_is_not_chosen_from(wrong: dict) -> None:
+    given = {"planes": 9, "cells": 3, "width": 7, "kind": "f4", "size": 2, "radius": 4, "height": 6}
+
+    def choose(planes, cells, width, kind, size, radius, height):
+        parts = tuple(np.zeros((cells, 7), np.float32) for _ in range(planes))
+        chosen = tuple(np.zeros((5, width), kind) for _ in range(4))
+        plane_fits._compiled.choose(parts, chosen, height, size, radius, 0, 3.0)
+
+    choose(**given)
+    with pytest.raises(ValueError, match=r"planes|pictures"):
+        choose(**given | wrong)
 
 
 PLANE = np.ones(ROWS.shape, bool)

@@ -1,10 +1,55 @@
-/* Chooses among planes that were fitted: what `_choose` of plane_fits.py does, row after row. */
+/* What `_trusted` and `_choose` of plane_fits.py do, row after row. */
 
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030B0000
 #include <Python.h>
 #include <math.h>
+#include <stdint.h>
 #include <stdlib.h>
+
+/* Add to the counts of two rows where a measurement and the one dx further on in the other row
+ * agree: they are no further apart, but for what is near, than the root of what is allowed both. */
+static inline void compare(const float *restrict one, const float *restrict allowed,
+                           const float *restrict other, const float *restrict allowed_other,
+                           int dx, float near, int32_t *counts, int32_t *counts_other,
+                           int32_t *restrict agree, Py_ssize_t width)
+{
+    Py_ssize_t start = dx < 0 ? -dx : 0, stop = dx > 0 ? width - dx : width;
+    for (Py_ssize_t at = start; at < stop; at++) {
+        float apart = fabsf(one[at] - other[at + dx]) - near;
+        /* NaN is apart from all. */
+        apart = apart < 0 ? 0 : apart;
+        agree[at] = apart * apart <= allowed[at] + allowed_other[at + dx];
+    }
+    for (Py_ssize_t at = start; at < stop; at++)
+        counts[at] += agree[at];
+    for (Py_ssize_t at = start; at < stop; at++)
+        counts_other[at + dx] += agree[at];
+}
+
+/* Room is for three rows. */
+static void trust(const float *value, const float *allowed, uint8_t *trusted, Py_ssize_t height,
+                  Py_ssize_t width, float near, int least, int32_t *room)
+{
+    int32_t *here = room, *below = room + width, *agree = room + 2 * width;
+    for (Py_ssize_t at = 0; at < width; at++)
+        here[at] = below[at] = 0;
+    for (Py_ssize_t row = 0; row < height; row++) {
+        const float *own = value + row * width, *of_own = allowed + row * width;
+        compare(own, of_own, own, of_own, 1, near, here, here, agree, width);
+        if (row + 1 < height)
+            for (int dx = -1; dx <= 1; dx++)
+                compare(own, of_own, own + width, of_own + width, dx, near, here, below, agree,
+                        width);
+        for (Py_ssize_t at = 0; at < width; at++)
+            trusted[row * width + at] = here[at] >= least;
+        int32_t *done = here;
+        here = below;
+        below = done;
+        for (Py_ssize_t at = 0; at < width; at++)
+            below[at] = 0;
+    }
+}
 
 /* The parts of `_Planes`, and of `_Choice`. */
 enum { A, B, C, AA, AB, AC, BB, BC, CC, PLANES };
@@ -151,7 +196,48 @@ static PyObject *py_choose(PyObject *module, PyObject *arguments)
     Py_RETURN_NONE;
 }
 
+static PyObject *py_trust(PyObject *module, PyObject *arguments)
+{
+    PyObject *arrays[3];
+    Py_buffer views[3];
+    int held = 0, least;
+    float near;
+    int32_t *room = NULL;
+    (void)module;
+    if (!PyArg_ParseTuple(arguments, "OOOfi", arrays, arrays + 1, arrays + 2, &near, &least))
+        return NULL;
+    while (held < 3 && !PyErr_Occurred()) {
+        if (PyObject_GetBuffer(arrays[held], views + held,
+                               PyBUF_C_CONTIGUOUS | (held == 2 ? PyBUF_WRITABLE : 0)))
+            break;
+        const Py_buffer *own = views + held++;
+        if (own->ndim != 2 || own->itemsize != (held == 3 ? 1 : 4) ||
+            own->shape[0] != views->shape[0] || own->shape[1] != views->shape[1])
+            PyErr_SetString(PyExc_ValueError, "no pictures of one size");
+    }
+    if (!PyErr_Occurred()) {
+        Py_ssize_t height = views->shape[0], width = views->shape[1];
+        if ((room = malloc((size_t)(3 * width + 1) * sizeof *room))) {
+            Py_BEGIN_ALLOW_THREADS
+            trust(views[0].buf, views[1].buf, views[2].buf, height, width, near, least, room);
+            Py_END_ALLOW_THREADS
+        } else {
+            PyErr_NoMemory();
+        }
+    }
+    free(room);
+    while (held > 0)
+        PyBuffer_Release(&views[--held]);
+    if (PyErr_Occurred())
+        return NULL;
+    Py_RETURN_NONE;
+}
+
 static PyMethodDef methods[] = {
+    {"trust", py_trust, METH_VARARGS,
+     "trust(value, allowed, trusted, near, least)\n\n"
+     "Which measurements agree with at least so many of the eight around them: value and allowed,\n"
+     "(H, W) single floats; trusted, (H, W) bool, is written to."},
     {"choose", py_choose, METH_VARARGS,
      "choose(planes, chosen, height, size, radius, first, agrees)\n\n"
      "Replace what was chosen where a plane is known better. planes is a `_Planes`, for so many\n"

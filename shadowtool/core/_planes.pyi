@@ -1,5 +1,14 @@
 from typing import Any
 
+from numpy.typing import NDArray
+
+def trust(
+    value: NDArray[Any],
+    allowed: NDArray[Any],
+    trusted: NDArray[Any],
+    near: float,
+    least: int,
+) -> None: ...
 def choose(
     planes: tuple[Any, ...],
     chosen: tuple[Any, ...],

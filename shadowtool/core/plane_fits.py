@@ -145,6 +145,10 @@ def _trusted(value: Float32, known: Bool, variance: Float32, near: float) -> Boo
     """Which of the known measurements agree with enough of the eight around them."""
     value = np.where(known, value, np.float32(np.nan))
     allowed = variance * np.float32(_AGREES**2)
+    if _compiled is not None:
+        trusted = np.empty(value.shape, bool)
+        _compiled.trust(value, allowed, trusted, near, _COMPANY)
+        return trusted
     company = np.zeros(value.shape, np.uint8)
     # The other four directions are these from the other pixel's point of view.
     for rows in bands(value.shape):

@@ -39,7 +39,7 @@ _BINS, _CERTAIN, _TOO_OFTEN = 50, 0.2, 2.0
 _LOCAL = 15
 # So many arrays of pixels are worked on together; about so many rows tell how fast an edge moves,
 # and pixels what they usually lose.
-_ARRAYS, _SLOPE_ROWS, _USUAL = 12, 256, 100_000
+_ARRAYS, _SLOPE_ROWS, _USUAL = 4, 128, 100_000
 # How well an edge's profile is known, as a part of its duration; and the least error, frames.
 _PROFILE, _LEAST_ERROR = 0.1, 0.01
 # From the first duration on, in frames, to the second, interpolation between the frames takes over.

@@ -297,6 +297,15 @@ def test_what_does_not_fit_together_is_not_chosen_from(wrong: dict) -> None:
         choose(**given | wrong)
 
 
+@compiled
+def test_what_is_of_another_size_is_not_trusted() -> None:
+    value, out = np.zeros((3, 4), np.float32), np.zeros((3, 4), bool)
+    plane_fits._compiled.trust(value, value, out, 1.0, 3)
+    for wrong in (value[:2], value[:, :3].copy(), value.astype("f8"), value.ravel()):
+        with pytest.raises(ValueError, match="pictures of one size"):
+            plane_fits._compiled.trust(value, wrong, out, 1.0, 3)
+
+
 PLANE = np.ones(ROWS.shape, bool)
 SLOPED = 3 + 0.1 * ROWS - 0.07 * COLUMNS
 

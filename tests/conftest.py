@@ -174,13 +174,15 @@ def narrow_bands(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     return narrow
 
 
-def write_sum(red: np.ndarray, green: np.ndarray, blue: np.ndarray, made: np.ndarray) -> None:
-    """Something to be made of a picture's channels."""
-    made[:] = red + 2 * green + 4 * blue
+def write_sum(
+    rows: slice, red: np.ndarray, green: np.ndarray, blue: np.ndarray, made: np.ndarray
+) -> None:
+    """Something to be made of a picture's channels, and of where they are."""
+    made[:] = red + 2 * green + 4 * blue + np.arange(rows.start, rows.stop)[:, np.newaxis]
 
 
 def sum_of(*channels: np.ndarray) -> np.ndarray:
     """What `write_sum` writes of three channels (H, W)."""
     made = np.empty(channels[0].shape, np.float16)
-    write_sum(*channels, made)
+    write_sum(slice(0, len(made)), *channels, made)
     return made

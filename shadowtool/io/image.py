@@ -115,13 +115,12 @@ class Image:
         Raises:
             InputError: there is no colour that could be meant.
         """
-        apart = self._apart()
-        values = _joined(apart) if apart else _three_channels(self.layers[self._colour_layer()])
+        values = _three_channels(self.layers[self._colour_layer()])
         return decode(values, resolve_transfer(transfer, self.path))
 
     def colours(self, transfer: str = "auto") -> tuple[NDArray[np.floating], ...]:
         """The three channels of `rgb`, (H, W) each."""
-        stored = self._apart()
+        stored = [self.layers[name] for name in "RGB" if set("RGB") <= self.layers.keys()]
         if not stored:
             values = _three_channels(self.layers[self._colour_layer()])
             stored = [_one_channel(values, index) for index in range(3)]
@@ -196,11 +195,6 @@ class Image:
                 return _unit(_one_channel(values, layer.index(name)))
         raise InputError(f"{self.path}: has no channel {name}, only {', '.join(self.layers)}")
 
-    def _apart(self) -> list[NDArray[Any]]:
-        """R, G and B where each is a layer of its own."""
-        names = "RGB" if set("RGB") <= self.layers.keys() else ""
-        return [self.layers[name] for name in names]
-
     def _colour_layer(self) -> str:
         for name in ("RGB", "RGBA"):
             if name in self.layers:
@@ -257,7 +251,7 @@ def _joined(channels: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return cv2.merge(whole).view(kind)
 
 
-def _apart(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _by_channel(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Each channel (H, W) by its own name."""
     channels = {}
     for name, values in arrays.items():
@@ -311,12 +305,8 @@ def read_header(path: Path) -> Header:
         return read_image(path).header
 
 
-def read_image(path: Path, apart: bool = False) -> Image:
+def read_image(path: Path) -> Image:
     """Read a picture whole.
-
-    Args:
-        apart: leave an EXR's channels R, G and B as they are in the file, each for itself, for
-            `Image.colours`.
 
     Raises:
         InputError: as `read_header`.
@@ -325,7 +315,7 @@ def read_image(path: Path, apart: bool = False) -> Image:
     if path.suffix.lower() == PNG:
         return _decode_png(path, read_content(path))
     with unchanging(path) as file:
-        return _decode_exr(path, file, apart)
+        return _decode_exr(path, file)
 
 
 class Made(NamedTuple):
@@ -341,9 +331,8 @@ def read_made(path: Path, make: scanlines.Make, transfer: str = "auto") -> Made:
     while these are close at hand, and no more is kept of them.
 
     Args:
-        make: is given the three channels as `Image.colours` gives them, but some rows at a time,
-            (N, W) each, and what it is to write to, (N, W) halfs; each of these by the same pixel's
-            values alone, and 0 of 0.
+        make: is given some rows, their three channels as `Image.colours` gives them, (N, W) each,
+            and what it is to write to, (N, W) halfs; some rows perhaps again.
 
     Raises:
         InputError, DamagedFileError: as `read_image`; InputError also if there is no colour.
@@ -353,19 +342,19 @@ def read_made(path: Path, make: scanlines.Make, transfer: str = "auto") -> Made:
     else:
         taken = resolve_transfer(transfer, path)
 
-        def of_stored(
-            red: NDArray[Any], green: NDArray[Any], blue: NDArray[Any], made: NDArray[np.float16]
-        ) -> None:
-            make(decode(red, taken), decode(green, taken), decode(blue, taken), made)
+        def of_stored(rows: slice, *stored: NDArray[Any]) -> None:
+            *channels, made = stored
+            red, green, blue = (decode(channel, taken) for channel in channels)
+            make(rows, red, green, blue, made)
 
         with unchanging(path) as file:
-            image = _decode_exr(path, file, apart=True, make=of_stored)
+            image = _decode_exr(path, file, of_stored)
     if scanlines.MADE in image.layers:
         values = image.layers[scanlines.MADE]
     else:
         red, green, blue = image.colours(transfer)
         values = np.empty(red.shape, np.float16)
-        make(red, green, blue, values)
+        make(slice(0, len(values)), red, green, blue, values)
     return Made(image.header, values, image.fingerprint)
 
 
@@ -433,7 +422,7 @@ def encode_exr(
     try:
         if scanlines.encodes():
             head = bytes(_one_pixel(attributes, arrays))
-            encoded = scanlines.encode(head, _apart(arrays), level)
+            encoded = scanlines.encode(head, _by_channel(arrays), level)
             if encoded is not None:
                 return encoded
         with _zip_level.at(level):
@@ -580,19 +569,25 @@ def _window(path: Path, raw: Mapping[str, Any], name: str) -> tuple[Corner, Corn
     return (first[0], first[1]), (last[0], last[1])
 
 
-def _decode_exr(path: Path, file: File, apart: bool, make: scanlines.Make | None = None) -> Image:
+def _decode_exr(path: Path, file: File, make: scanlines.Make | None = None) -> Image:
+    """A picture; if something is to be made of its colours that alone, or its R, G and B each for
+    itself."""
+    apart = make is not None
     # The header first: a picture that is refused must not be decoded, and a damaged part of a
     # multi-part file vanishes without a word when the pixels are read.
     listed = _open_exr(path, file.source, header_only=True)
     header = _exr_header(path, listed)
     raw = listed.header(0)
     channels: Mapping[str, NDArray[Any] | None] | None = None
+    first, last = window = _window(path, raw, "dataWindow")
+    if window != _window(path, raw, "displayWindow"):
+        # Rows of the file are not the picture's.
+        make = None
     # What is left to OpenEXR need not be in memory.
     if len(listed.parts) == 1 and scanlines.decodes(int(raw["compression"])):
         channels = scanlines.decode(file.content, apart, make)
     if channels is None:
         channels = _channels(path, file.source, listed, apart)
-    first, last = _window(path, raw, "dataWindow")
     layers = {}
     for name, values in channels.items():
         if values is None or values.shape[:2] != (last[1] - first[1] + 1, last[0] - first[0] + 1):

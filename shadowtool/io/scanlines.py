@@ -26,8 +26,8 @@ except ImportError:
     _zip = None  # type: ignore[assignment]
 
 Bytes = NDArray[np.uint8]
-# What makes something of R, G and B, (N, W) each, and writes it to an array of halfs (N, W).
-Make = Callable[[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.float16]], object]
+# What makes something of some rows' R, G and B, (N, W) each, and writes it to halfs (N, W).
+Make = Callable[[slice, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[np.float16]], object]
 
 _MAGIC = b"v/1\x01"
 # The version, and a flag that says nothing but that names may be long: one part, in scanlines.
@@ -322,7 +322,7 @@ def _made(chunks: _Chunks, layout: _Layout, make: Make) -> NDArray[np.float16]:
     made = np.empty((layout.height, layout.width), np.float16)
     for rows, stored in _by_bands(chunks, layout):
         red, green, blue = (layout.values(stored, name) for name in "RGB")
-        make(red, green, blue, made[rows])
+        make(rows, red, green, blue, made[rows])
     return made
 
 

@@ -1,10 +1,10 @@
 """Footage: a sequence whose frames are known to fit together, read as linear light."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ logger = logging.getLogger(__name__)
 
 Float16 = NDArray[np.float16]
 Float32 = NDArray[np.float32]
+Look = Callable[[slice, NDArray[Any], NDArray[Any], NDArray[Any]], object]
 
 
 class Survey(NamedTuple):
@@ -79,24 +80,40 @@ class Footage:
             return None
         return float(decode(np.ones(1, np.float32), self.transfer)[0])
 
-    def image(self, frame: Frame, apart: bool = False) -> Image:
+    def image(self, frame: Frame) -> Image:
         """Read a frame.
-
-        Args:
-            apart: as of `read_image`.
 
         Raises:
             InputError, DamagedFileError: it can't be read, or is of another size.
         """
-        image = read_image(self.sequence.path(frame), apart)
+        image = read_image(self.sequence.path(frame))
         _require_same(image.path, image.header, self.header, self.sequence.pattern)
         return image
 
-    def luminance(self, frame: Frame) -> tuple[Float16, str]:
+    def luminance(self, frame: Frame, look: Look | None = None) -> tuple[Float16, str]:
         """(H, W) as of `luminance_halfs`, where the camera saw it, and the file's fingerprint.
-        Raises as `image`."""
+
+        Args:
+            look: is shown linear light, the same, on the way: some rows' R, G and B, (N, W) each;
+                some rows perhaps again.
+
+        Raises:
+            InputError, DamagedFileError: as `image`.
+        """
+
+        def make(
+            rows: slice,
+            red: NDArray[Any],
+            green: NDArray[Any],
+            blue: NDArray[Any],
+            made: Float16,
+        ) -> None:
+            luminance_halfs(red, green, blue, made)
+            if look is not None:
+                look(rows, red, green, blue)
+
         path = self.sequence.path(frame)
-        header, gray, mark = read_made(path, luminance_halfs, self.transfer)
+        header, gray, mark = read_made(path, make, self.transfer)
         _require_same(path, header, self.header, self.sequence.pattern)
         return gray, mark
 

@@ -14,7 +14,14 @@ from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.camera_motion import displaced
 from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
 from shadowtool.core.exposure import RunningGain, sampled_areas, without_gain
-from shadowtool.core.noise import NoiseModel, noise_levels, noise_model, sample_positions, thin
+from shadowtool.core.noise import (
+    NoiseModel,
+    grid_step,
+    noise_levels,
+    noise_model,
+    sample_positions,
+    thin,
+)
 from shadowtool.core.pictures import display, time_picture
 from shadowtool.core.plane_fits import understated
 from shadowtool.core.shadow_lines import (
@@ -30,7 +37,6 @@ from shadowtool.core.shadow_lines import (
 from shadowtool.core.shadow_time import (
     SHADE,
     ShadowTimes,
-    luminance_halfs,
     misled,
     own_times,
     refined_times,
@@ -250,32 +256,37 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
 
     def read(position: int) -> _Seen | None:
         try:
-            sampled = position == 0 or position in samples.values()
-            return whole(position) if sampled else gray_alone(position)
+            return seen(position)
         except MissingError as error:
             if run.missing == "skip":
                 say_skipped(error)
                 return None
             raise
 
-    def gray_alone(position: int) -> _Seen:
-        gray, mark = footage.luminance(frames[position])
-        gray = displaced(gray, footage.off(gray))
-        return _Seen(gray, sampled_areas(gray), None, None, mark)
+    def seen(position: int) -> _Seen:
+        sampled, height, width = position in samples.values(), *footage.header.size[::-1]
+        # To be moved, a picture has to be whole.
+        every = 1 if footage.vantage is not None else grid_step(height, width)
+        thinned = np.empty((-(-height // every), -(-width // every), 3), np.float32)
+        picture = np.empty((height, width, 3), np.uint8) if position == 0 else None
 
-    def whole(position: int) -> _Seen:
-        image = footage.image(frames[position], apart=True)
-        colours = image.colours(footage.transfer)
-        sample = picture = None
-        if position == 0:
-            picture = np.stack([display(plane) for plane in colours], axis=-1)
-        gray = luminance_halfs(*colours)
+        def look(rows: slice, *colours: NDArray[np.floating]) -> None:
+            kept = slice(-(-rows.start // every), -(-rows.stop // every))
+            for index, colour in enumerate(colours):
+                thinned[kept, :, index] = colour[-rows.start % every :: every, ::every]
+                if picture is not None:
+                    picture[rows, :, index] = display(colour)
+
+        looked_at = sampled or picture is not None
+        gray, mark = footage.luminance(frames[position], look if looked_at else None)
         place = footage.off(gray)
         gray = displaced(gray, place)
-        if position in samples.values():
-            colours = tuple(displaced(plane, place) for plane in colours)
-            sample = np.stack([thin(plane) for plane in colours], axis=-1), strips(gray)
-        return _Seen(gray, sampled_areas(gray), sample, picture, image.fingerprint)
+        sample = None
+        if sampled:
+            if every == 1:
+                thinned = thin(displaced(thinned, place))
+            sample = thinned, strips(gray)
+        return _Seen(gray, sampled_areas(gray), sample, picture, mark)
 
     finder, exposure = CrossingFinder(), RunningGain()
     marks, gains, bad = list[str](), dict[Frame, float](), dict[str, int]()

@@ -429,7 +429,7 @@ def test_channels_out_of_order_are_left_to_openexr(tmp_path):
 
 
 def test_what_goes_wrong_in_the_making_is_no_damage(plain):
-    def fail(red, green, blue, made):
+    def fail(rows, red, green, blue, made):
         raise ValueError("of its own")
 
     with pytest.raises(ValueError, match="of its own"):

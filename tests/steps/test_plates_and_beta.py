@@ -426,9 +426,9 @@ def test_sampled_frames_are_read_once_as_far_as_they_are_kept(
 ) -> None:
     read = []
 
-    def counting(path: Path, apart: bool = False) -> Image:
+    def counting(path: Path) -> Image:
         read.append(path)
-        return read_image(path, apart)
+        return read_image(path)
 
     monkeypatch.setattr("shadowtool.steps.footage.read_image", counting)
     plate(takes / "walk", tmp_path / "kept")

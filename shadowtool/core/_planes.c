@@ -1,4 +1,4 @@
-/* What `_trusted` and `_choose` of plane_fits.py do, row after row. */
+/* What `_trusted`, `_moments` and `_choose` of plane_fits.py do, row after row. */
 
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030B0000
@@ -17,9 +17,7 @@ static inline void compare(const float *restrict one, const float *restrict allo
     Py_ssize_t start = dx < 0 ? -dx : 0, stop = dx > 0 ? width - dx : width;
     for (Py_ssize_t at = start; at < stop; at++) {
         float apart = fabsf(one[at] - other[at + dx]) - near;
-        /* NaN is apart from all. */
-        apart = apart < 0 ? 0 : apart;
-        agree[at] = apart * apart <= allowed[at] + allowed_other[at + dx];
+        agree[at] = (apart <= 0) | (apart * apart <= allowed[at] + allowed_other[at + dx]);
     }
     for (Py_ssize_t at = start; at < stop; at++)
         counts[at] += agree[at];
@@ -48,6 +46,102 @@ static void trust(const float *value, const float *allowed, uint8_t *trusted, Py
         below = done;
         for (Py_ssize_t at = 0; at < width; at++)
             below[at] = 0;
+    }
+}
+
+/* Sums over a cell's pixels in a row or column, times the powers 0, 1 and 2 of their places counted
+ * from its middle; pixels on either side of it are taken together first. */
+static inline void powers(const double *parts, int size, double *sums)
+{
+    if (size == 2) {
+        double both = parts[1] + parts[0];
+        sums[0] = both;
+        sums[1] = (parts[1] - parts[0]) * 0.5;
+        sums[2] = both * 0.25;
+    } else {
+        double inner = parts[2] + parts[1], outer = parts[3] + parts[0];
+        sums[0] = inner + outer;
+        sums[1] = (parts[2] - parts[1]) * 0.5 + (parts[3] - parts[0]) * 1.5;
+        sums[2] = inner * 0.25 + outer * 2.25;
+    }
+}
+
+/* How many moments there are; and how many sums down a cell's columns they are made of: of weights
+ * by the powers of y, of weighted values by two of them, of their squares, and of pixels. */
+enum { DOWN = 7, MOMENTS = 11 };
+
+/* Sums down the columns of a row of cells, whose rows of pixels these are. */
+static inline void add_down(const double *const *value, const double *const *weight, int size,
+                            double *restrict down, Py_ssize_t stride, Py_ssize_t width)
+{
+    for (Py_ssize_t at = 0; at < width; at++) {
+        double once[4], weighted[4], twice[4], used[4], sums[3];
+        for (int row = 0; row < size; row++) {
+            once[row] = weight[row][at];
+            weighted[row] = once[row] * value[row][at];
+            twice[row] = weighted[row] * value[row][at];
+            used[row] = once[row] > 0 ? 1 : 0;
+        }
+        powers(once, size, sums);
+        down[at] = sums[0];
+        down[at + stride] = sums[1];
+        down[at + 2 * stride] = sums[2];
+        powers(weighted, size, sums);
+        down[at + 3 * stride] = sums[0];
+        down[at + 4 * stride] = sums[1];
+        powers(twice, size, sums);
+        down[at + 5 * stride] = sums[0];
+        powers(used, size, sums);
+        down[at + 6 * stride] = sums[0];
+    }
+}
+
+/* The moments of a row of cells: 1, x, y, x², xy, y²; 1, x, y; 1; 1. `plane` is how far one lies
+ * from the next. */
+static inline void add_across(const double *down, Py_ssize_t stride, int size, double *moments,
+                              Py_ssize_t plane, Py_ssize_t cells)
+{
+    for (Py_ssize_t cell = 0; cell < cells; cell++) {
+        const double *parts = down + cell * size;
+        double *own = moments + cell, sums[DOWN][3];
+        for (int part = 0; part < DOWN; part++)
+            powers(parts + part * stride, size, sums[part]);
+        own[0] = sums[0][0];
+        own[plane] = sums[0][1];
+        own[2 * plane] = sums[1][0];
+        own[3 * plane] = sums[0][2];
+        own[4 * plane] = sums[1][1];
+        own[5 * plane] = sums[2][0];
+        own[6 * plane] = sums[3][0];
+        own[7 * plane] = sums[3][1];
+        own[8 * plane] = sums[4][0];
+        own[9 * plane] = sums[5][0];
+        own[10 * plane] = sums[6][0];
+    }
+}
+
+typedef struct {
+    const double *value, *weight;
+    Py_ssize_t height, width;
+    double *moments;
+    Py_ssize_t rows, columns;
+} cells_t;
+
+/* Room is for the sums down a row of cells, and for a row of nothing after them. */
+static inline void add_up(const cells_t *cells, int size, double *room)
+{
+    Py_ssize_t stride = cells->columns * size, plane = cells->rows * cells->columns;
+    const double *nothing = room + DOWN * stride;
+    for (Py_ssize_t row = 0; row < cells->rows; row++) {
+        const double *value[4], *weight[4];
+        for (int part = 0; part < size; part++) {
+            Py_ssize_t own = row * size + part;
+            value[part] = own < cells->height ? cells->value + own * cells->width : nothing;
+            weight[part] = own < cells->height ? cells->weight + own * cells->width : nothing;
+        }
+        add_down(value, weight, size, room, stride, cells->width);
+        add_across(room, stride, size, cells->moments + row * cells->columns, plane,
+                   cells->columns);
     }
 }
 
@@ -233,7 +327,58 @@ static PyObject *py_trust(PyObject *module, PyObject *arguments)
     Py_RETURN_NONE;
 }
 
+static PyObject *py_add_up(PyObject *module, PyObject *arguments)
+{
+    PyObject *arrays[3];
+    Py_buffer views[3];
+    int held = 0, size;
+    double *room = NULL;
+    (void)module;
+    if (!PyArg_ParseTuple(arguments, "OOOi", arrays, arrays + 1, arrays + 2, &size))
+        return NULL;
+    if (size != 2 && size != 4)
+        PyErr_SetString(PyExc_ValueError, "cells of another size");
+    while (held < 3 && !PyErr_Occurred()) {
+        if (PyObject_GetBuffer(arrays[held], views + held,
+                               PyBUF_C_CONTIGUOUS | (held == 2 ? PyBUF_WRITABLE : 0)))
+            break;
+        const Py_buffer *own = views + held++;
+        int whole = own->itemsize == 8 && own->ndim == (held == 3 ? 3 : 2);
+        for (int side = 0; whole && side < 2; side++) {
+            Py_ssize_t length = views->shape[side], cells = length / size + (length % size > 0);
+            whole = held == 3 ? own->shape[1 + side] == cells : own->shape[side] == length;
+        }
+        if (!whole || (held == 3 && own->shape[0] != MOMENTS))
+            PyErr_SetString(PyExc_ValueError, "no pictures of one size, or not as many cells");
+    }
+    if (!PyErr_Occurred()) {
+        cells_t cells = {views[0].buf, views[1].buf, views->shape[0], views->shape[1],
+                         views[2].buf, views[2].shape[1], views[2].shape[2]};
+        size_t count = (size_t)((DOWN + 1) * cells.columns * size + 1);
+        if ((room = calloc(count, sizeof *room))) {
+            Py_BEGIN_ALLOW_THREADS
+            if (size == 2)
+                add_up(&cells, 2, room);
+            else
+                add_up(&cells, 4, room);
+            Py_END_ALLOW_THREADS
+        } else {
+            PyErr_NoMemory();
+        }
+    }
+    free(room);
+    while (held > 0)
+        PyBuffer_Release(&views[--held]);
+    if (PyErr_Occurred())
+        return NULL;
+    Py_RETURN_NONE;
+}
+
 static PyMethodDef methods[] = {
+    {"add_up", py_add_up, METH_VARARGS,
+     "add_up(value, weight, moments, size)\n\n"
+     "The moments of cells of 2 or 4 pixels squared: value and weight, (H, W), and moments,\n"
+     "(11, h, w), which is written to, double floats."},
     {"trust", py_trust, METH_VARARGS,
      "trust(value, allowed, trusted, near, least)\n\n"
      "Which measurements agree with at least so many of the eight around them: value and allowed,\n"

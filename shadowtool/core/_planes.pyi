@@ -9,6 +9,7 @@ def trust(
     near: float,
     least: int,
 ) -> None: ...
+def add_up(value: NDArray[Any], weight: NDArray[Any], moments: NDArray[Any], size: int) -> None: ...
 def choose(
     planes: tuple[Any, ...],
     chosen: tuple[Any, ...],

@@ -53,6 +53,13 @@ _LEAST_VARIANCE = 1e-6
 _WIDE = {8: 2, 16: 4}
 # So many arrays of pixels are worked on together.
 _ARRAYS = 6
+# What weights, weighted values, their squares, and the number of pixels are summed up with.
+_POWERS: tuple[Powers, ...] = (
+    ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)),
+    ((0, 0), (1, 0), (0, 1)),
+    ((0, 0),),
+    ((0, 0),),
+)
 
 
 @dataclass(frozen=True)
@@ -368,12 +375,7 @@ def _images(value: Float64, weight: Float64) -> list[tuple[Floats, Powers]]:
     """What is summed up over windows, and times which powers (a, b) of the place, xᵃyᵇ."""
     weighted = weight * value
     used = (weight > 0).astype(np.float32)
-    return [
-        (weight, ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))),
-        (weighted, ((0, 0), (1, 0), (0, 1))),
-        (weighted * value, ((0, 0),)),
-        (used, ((0, 0),)),
-    ]
+    return list(zip((weight, weighted, weighted * value, used), _POWERS, strict=True))
 
 
 def _window_sums(value: Float64, weight: Float64, size: int, cells: int) -> list[Floats]:
@@ -407,6 +409,11 @@ def _window_sums(value: Float64, weight: Float64, size: int, cells: int) -> list
 def _moments(value: Float64, weight: Float64, size: int) -> list[Moments]:
     """Sums of the `_images` over each cell, x and y counted from its middle in pixels."""
     height, width = (-(-length // size) for length in value.shape)
+    if _compiled is not None:
+        planes = np.empty((sum(map(len, _POWERS)), height, width))
+        _compiled.add_up(value, weight, planes, size)
+        every = iter(planes)
+        return [{power: next(every) for power in powers} for powers in _POWERS]
     sums: list[Moments] = []
     for rows in bands((height, size * value.shape[1])):
         taken = slice(size * rows.start, size * rows.stop)

@@ -298,6 +298,19 @@ def test_what_does_not_fit_together_is_not_chosen_from(wrong: dict) -> None:
 
 
 @compiled
+@pytest.mark.parametrize(
+    ("size", "shape"), [(1, (11, 6, 7)), (3, (11, 2, 3)), (4, (10, 2, 2)), (4, (11, 2, 3))]
+)
+def test_cells_that_do_not_fit_the_picture_are_not_added_up(size, shape) -> None:
+    value = np.ones((6, 7))
+    plane_fits._compiled.add_up(value, value, np.empty((11, 2, 2)), 4)
+    with pytest.raises(ValueError, match="cells"):
+        plane_fits._compiled.add_up(value, value, np.empty(shape), size)
+    with pytest.raises(ValueError, match="cells"):
+        plane_fits._compiled.add_up(value, value[:, :6].copy(), np.empty((11, 2, 2)), 4)
+
+
+@compiled
 def test_what_is_of_another_size_is_not_trusted() -> None:
     value, out = np.zeros((3, 4), np.float32), np.zeros((3, 4), bool)
     plane_fits._compiled.trust(value, value, out, 1.0, 3)

@@ -199,7 +199,8 @@ def own_times(
         # Where an edge falls by less than the noise from frame to frame, noise chooses the frame.
         chosen = (_CHOSEN / 2) * (sigmas[0] + sigmas[1])
         between = np.fmax((part.before - part.after) / contrast, 0) ** 2 - chosen**2
-        np.multiply(np.sqrt(np.maximum(between, 0)), known[rows], out=fall[rows])
+        # Of what was never known, NaN; in a mean it would spread.
+        fall[rows] = np.where(known[rows], np.sqrt(np.maximum(between, 0)), np.float32(0))
     least = [np.float32(_least_caught(count)) for count in counts]
     for rows in cuts:
         total = passing[rows]

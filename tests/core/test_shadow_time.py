@@ -146,6 +146,19 @@ def test_a_broken_pixel_does_not_spread() -> None:
     assert np.array_equal(found, clean, equal_nan=True)
 
 
+def test_a_pixel_that_is_never_known_changes_nothing_elsewhere() -> None:
+    frames = sweep_frames(Sweep(0.5, soft=24.0), noise=0.003)
+    whole = own_times(crossings_of(frames), NOISE)
+    for frame in frames:
+        frame[20, 30] = np.nan
+    found = own_times(crossings_of(frames), NOISE)
+    assert np.isnan(found[0][20, 30])
+    elsewhere = np.isfinite(whole[0])
+    elsewhere[4:37, 14:47] = False
+    for one, other in zip(found, whole, strict=True):
+        np.testing.assert_allclose(one[elsewhere], other[elsewhere], rtol=1e-5)
+
+
 def test_contrast_is_the_range_of_the_luminance() -> None:
     crossings = crossings_of(sweep_frames(Sweep(0.0)))
     found = crossings.highest - crossings.lowest

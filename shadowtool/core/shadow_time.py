@@ -20,10 +20,10 @@ from shadowtool.core.plane_fits import Windows, fit_planes
 from shadowtool.core.transfer import LUMA
 
 try:
-    from shadowtool.core import _luminance
+    from shadowtool.core import _luminance, _own_times
 except ImportError:
     # No compiler was there when this was installed.
-    _luminance = None  # type: ignore[assignment]
+    _luminance = _own_times = None  # type: ignore[assignment]
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -154,7 +154,7 @@ def _passed(crossings: Crossings, threshold: NDArray[np.floating]) -> Float32:
     before, after = crossings.before, crossings.after
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         part = (before - threshold) / (before - after)
-    return np.asarray(crossings.at - 1 + np.clip(part, 0, 1), np.float32)
+    return np.asarray(crossings.at.astype(np.float32) - 1 + np.clip(part, 0, 1), np.float32)
 
 
 def own_times(
@@ -178,29 +178,11 @@ def own_times(
         unknown, and how many frames the edge takes to pass; (H, W) float32 each.
     """
     known = crossings.at > 0
-    lost, left, passing, fall = (np.empty(known.shape, np.float32) for _ in range(4))
-    counts = np.zeros((2, _BINS))
-    cuts = list(bands(known.shape, _ARRAYS))
-    ends = (crossings.highest, crossings.lowest) if trembling else ()
+    ends = (crossings.lowest, crossings.highest) if trembling else ()
     rough = [np.float32(trembling) * _slope(end) for end in ends]
-
-    def extremes(rows: slice) -> tuple[Float32, Float32, Float32, Float32, Float32]:
-        return _extremes(crossings.part(rows), noise, [texture[rows] for texture in rough])
-
-    for rows in cuts:
-        part = crossings.part(rows)
-        lit, dark, contrast, *sigmas = extremes(rows)
-        passed = (lost, lit - part.before), (left, part.after - dark)
-        for (values, of), count, sigma in zip(passed, counts, sigmas, strict=True):
-            seen = np.minimum(np.fmax(of / contrast, 0), 1)
-            count += _counts(seen, known[rows])
-            # Not caught is as good as not on its way.
-            np.multiply(seen, known[rows] & (seen > _CAUGHT * sigma), out=values[rows])
-        # Where an edge falls by less than the noise from frame to frame, noise chooses the frame.
-        chosen = (_CHOSEN / 2) * (sigmas[0] + sigmas[1])
-        between = np.fmax((part.before - part.after) / contrast, 0) ** 2 - chosen**2
-        # Of what was never known, NaN; in a mean it would spread.
-        fall[rows] = np.where(known[rows], np.sqrt(np.maximum(between, 0)), np.float32(0))
+    (lost, left, fall), counts = _caught(crossings, noise, rough)
+    passing = np.empty_like(lost)
+    cuts = list(bands(known.shape, _ARRAYS))
     least = [np.float32(_least_caught(count)) for count in counts]
     for rows in cuts:
         total = passing[rows]
@@ -212,13 +194,66 @@ def own_times(
     longer = 1 / np.maximum(_local_mean(fall, known), np.float32(1 / _LONGEST))
     # Two frames tell of no more than three.
     np.copyto(duration, longer, where=(longer > _LONG) & (duration > 1))
-    time, error = np.empty_like(lost), np.empty_like(lost)
-    for rows in cuts:
-        caught = lost[rows], left[rows]
-        told = _told(crossings.part(rows), extremes(rows), caught, duration[rows])
-        time[rows] = np.where(known[rows], told[0], np.float32(np.nan))
-        error[rows] = np.where(known[rows], told[1], np.float32(np.inf))
+    time, error = _told(crossings, noise, rough, (lost, left, duration))
     return time, error, duration
+
+
+def _caught(
+    crossings: Crossings, noise: NoiseModel, rough: list[Float32]
+) -> tuple[tuple[Float32, Float32, Float32], NDArray[np.number]]:
+    """What of an edge the two frames around each crossing caught.
+
+    Args:
+        rough: standard deviations of what was dark and lit besides the noise; nothing if there are
+            none.
+
+    Returns:
+        What part of the light was lost in the frame before, and what was left in the one after, 0
+        where that may be noise, and how much fell between them, (H, W) float32 each, 0 where no
+        crossing is known; and how often each part occurs of the first two, (2, _BINS).
+    """
+    lost, left, fall = (np.empty(crossings.at.shape, np.float32) for _ in range(3))
+    found = lost, left, fall
+    # Where an edge falls by less than the noise from frame to frame, noise chooses the frame.
+    chosen = _CHOSEN / 2
+    if _own_times is not None:
+        counted = np.zeros((2, _BINS), np.int64)
+        _own_times.catch(
+            _parts(crossings, rough), found, counted, *_numbers(crossings, noise), _CAUGHT, chosen
+        )
+        return found, counted
+    counts = np.zeros((2, _BINS))
+    for rows in bands(fall.shape, _ARRAYS):
+        part, known = crossings.part(rows), crossings.at[rows] > 0
+        lit, dark, contrast, *sigmas = _extremes(part, noise, [texture[rows] for texture in rough])
+        passed = (lost, lit - part.before), (left, part.after - dark)
+        for (values, of), count, sigma in zip(passed, counts, sigmas, strict=True):
+            seen = np.minimum(np.fmax(of / contrast, 0), 1)
+            count += _counts(seen, known)
+            # Not caught is as good as not on its way.
+            np.multiply(seen, known & (seen > _CAUGHT * sigma), out=values[rows])
+        noise_alone = chosen * (sigmas[0] + sigmas[1])
+        between = np.fmax((part.before - part.after) / contrast, 0) ** 2 - noise_alone**2
+        # Of what was never known, NaN; in a mean it would spread.
+        fall[rows] = np.where(known, np.sqrt(np.maximum(between, 0)), np.float32(0))
+    return found, counts
+
+
+def _parts(crossings: Crossings, rough: list[Float32]) -> tuple[NDArray[Any] | None, ...]:
+    """Crossings as the compiled functions take them."""
+    at, before, after, lowest, highest = crossings[:5]
+    return at, before, after, lowest, highest, *(rough or (None, None))
+
+
+def _numbers(crossings: Crossings, noise: NoiseModel) -> tuple[float, float, float]:
+    """Variance of luminance by light and without it, and how many standard deviations the extremes
+    of noise lie beyond what was lit and dark."""
+    return *_luminance_noise(noise), _largest(crossings.frames / 2)
+
+
+def _luminance_noise(noise: NoiseModel) -> tuple[float, float]:
+    weights = LUMA.astype(np.float64) ** 2
+    return float(weights @ noise.slope), float(weights @ noise.floor)
 
 
 def _slope(gray: Float32) -> Float32:
@@ -235,14 +270,13 @@ def _extremes(
     """Luminance lit and dark, their difference, and the standard deviations of both in its unit.
 
     Args:
-        rough: standard deviations of both besides the noise; nothing if there are none.
+        rough: as of `_caught`.
     """
     lit_sigma = _sigma(crossings.highest, noise)
     dark_sigma = _sigma(crossings.lowest, noise)
-    for sigma, more in zip((lit_sigma, dark_sigma), rough, strict=False):
-        np.hypot(sigma, more, out=sigma)
-    # The extremes of noise lie beyond what was lit and dark.
-    beyond = np.float32(_largest(crossings.frames / 2))
+    for sigma, more in zip((dark_sigma, lit_sigma), rough, strict=False):
+        np.sqrt(sigma * sigma + more * more, out=sigma)
+    beyond = np.float32(_numbers(crossings, noise)[-1])
     lit = crossings.highest - beyond * lit_sigma
     dark = crossings.lowest + beyond * dark_sigma
     contrast = np.maximum(lit - dark, np.float32(1e-6))
@@ -251,19 +285,47 @@ def _extremes(
 
 def _told(
     crossings: Crossings,
-    extremes: tuple[Float32, Float32, Float32, Float32, Float32],
-    caught: tuple[Float32, Float32],
-    duration: Float32,
+    noise: NoiseModel,
+    rough: list[Float32],
+    caught: tuple[Float32, Float32, Float32],
 ) -> tuple[Float32, Float32]:
-    """Times and errors of known pixels.
+    """Times and errors, NaN and infinite where no crossing is known.
 
     Args:
-        extremes: from `_extremes`.
+        rough: as of `_caught`.
         caught: what part of the light was lost in the frame before, and what was left in the one
-            after the crossing; 0 where the edge was not caught on its way.
-        duration: frames that the edge takes to pass, around each pixel.
+            after the crossing, 0 where the edge was not caught on its way; and how many frames it
+            takes to pass, around each pixel.
     """
-    lost, left = caught
+    found = time, error = np.empty_like(caught[0]), np.empty_like(caught[0])
+    if _own_times is not None:
+        numbers = _PROFILE**2, _LEAST_ERROR, 3 * _LEAST_ERROR, INTERVAL_ERROR, _SHARP
+        _own_times.tell(
+            _parts(crossings, rough),
+            caught,
+            found,
+            *_numbers(crossings, noise),
+            *numbers,
+            _SOFT - _SHARP,
+        )
+        return found
+    for rows in bands(time.shape, _ARRAYS):
+        part, known = crossings.part(rows), crossings.at[rows] > 0
+        extremes = _extremes(part, noise, [texture[rows] for texture in rough])
+        told = _told_of_known(part, extremes, *(values[rows] for values in caught))
+        time[rows] = np.where(known, told[0], np.float32(np.nan))
+        error[rows] = np.where(known, told[1], np.float32(np.inf))
+    return found
+
+
+def _told_of_known(
+    crossings: Crossings,
+    extremes: tuple[Float32, Float32, Float32, Float32, Float32],
+    lost: Float32,
+    left: Float32,
+    duration: Float32,
+) -> tuple[Float32, Float32]:
+    """`_told` of known pixels; the extremes as of `_extremes`."""
     lit, dark, _, lit_sigma, dark_sigma = extremes
     sharp = np.minimum(duration, 1)
     half, one = np.float32(0.5), np.float32(1)
@@ -411,8 +473,7 @@ def _least_caught(counts: NDArray[np.floating]) -> float:
 
 def _sigma(gray: Float32, noise: NoiseModel) -> Float32:
     """Standard deviation of the luminance ``gray``, (H, W)."""
-    weights = LUMA.astype(np.float64) ** 2
-    slope, floor = float(weights @ noise.slope), float(weights @ noise.floor)
+    slope, floor = _luminance_noise(noise)
     # Of NaN and 0 it gives 0.
     variance = np.fmax(gray, 0) * np.float32(slope)
     variance += np.float32(floor)

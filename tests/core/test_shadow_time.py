@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shadowtool.core import shadow_time
@@ -66,6 +66,70 @@ def test_luminance_of_any_halfs_is_the_same_bits_compiled_or_not(height, width, 
     assert (same | (np.isnan(expected) & np.isnan(found))).all()
 
 
+compiled = pytest.mark.skipif(
+    shadow_time._own_times is None, reason="it was installed without a compiler"
+)
+
+
+@compiled
+@settings(deadline=None)
+@given(
+    st.integers(1, 40),
+    st.integers(1, 40),
+    st.sampled_from([0.0, 0.001, 0.1]),
+    st.sampled_from([0.0, 0.3]),
+    st.integers(0, 9999),
+)
+@pytest.mark.filterwarnings("ignore:invalid value", "ignore:divide by zero")
+def test_times_are_the_same_bits_compiled_or_not(height, width, noise, trembling, seed):
+    """Of anything: sharp and soft edges, noise, what is never known, and no contrast at all."""
+    rng = np.random.default_rng(seed)
+    shape = height, width
+    lit = rng.choice([0.0, 0.01, 0.5, 3.0], shape)
+    dark = lit * rng.choice([0.0, 0.2, 0.9, 1.0], shape)
+    before = lit - (lit - dark) * rng.choice([0.0, 0.1, 0.4], shape)
+    after = dark + (lit - dark) * rng.choice([0.0, 0.1, 0.4], shape)
+    lights = [v + noise * rng.normal(size=shape) for v in (before, after, dark, lit)]
+    for light in lights:
+        light[rng.random(shape) < 0.05] = np.nan
+    before, after, dark, lit = (light.astype(np.float32) for light in lights)
+    at = rng.integers(0, 60, shape).astype(np.int32)
+    at[~np.isfinite(np.sum(lights, axis=0))] = 0
+    crossings = Crossings(at, before, after, dark, lit, at < 0, 60)
+    found = own_times(crossings, NOISE, trembling)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shadow_time, "_own_times", None)
+        expected = own_times(crossings, NOISE, trembling)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@compiled
+def test_arrays_that_do_not_belong_together_tell_no_times():
+    def told(at=5, light=5, kind="f4", out=5, counts=50, parts=7):
+        numbers = [np.zeros(light, kind) for _ in range(4)]
+        crossings = (np.zeros(at, np.int32), *numbers, None, None)[:parts]
+        found = tuple(np.zeros(out, np.float32) for _ in range(3))
+        shadow_time._own_times.catch(
+            crossings, found, np.zeros((2, counts), np.int64), 1, 1, 1, 1, 1
+        )
+        shadow_time._own_times.tell(crossings, found, found[:2], *[1.0] * 9)
+
+    told()
+    for wrong in (
+        {"at": 4},
+        {"light": 4},
+        {"kind": "f8"},
+        {"out": 6},
+        {"counts": 49},
+        {"parts": 6},
+    ):
+        with pytest.raises(ValueError, match="not as"):
+            told(**wrong)
+    with pytest.raises(TypeError):
+        shadow_time._own_times.catch((None,) * 7, (), None, 1, 1, 1, 1, 1)
+
+
 @pytest.mark.parametrize("kinds", ["eee", "fff", "efe"])
 def test_luminance_is_rounded_to_halfs_once(kinds):
     rng = np.random.default_rng(1)
@@ -76,7 +140,7 @@ def test_luminance_is_rounded_to_halfs_once(kinds):
         assert (off <= np.spacing(expected.astype(np.float16)) * 0.501).all()
 
 
-@pytest.mark.skipif(shadow_time._luminance is None, reason="it was installed without a compiler")
+@compiled
 def test_the_compiled_luminance_takes_nothing_but_rows_of_halfs():
     halfs = np.ones((4, 6), np.float16)
     for wrong in (halfs[:, :5], halfs[:3], halfs[:, ::2], halfs.astype("f4"), halfs.ravel()):

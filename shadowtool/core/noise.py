@@ -124,11 +124,11 @@ def sample_positions(frames: int) -> dict[int, int]:
 def thin(image: NDArray[np.floating]) -> Float32:
     """The fixed grid of about 10,000 pixels that is looked at of a frame, (H, W, 3) to (h, w, 3),
     or of one of its channels."""
-    step = grid_step(*image.shape[:2])
+    step = thinning(*image.shape[:2])
     return image[::step, ::step].astype(np.float32)
 
 
-def grid_step(height: int, width: int) -> int:
+def thinning(height: int, width: int) -> int:
     """How many pixels that grid's lines are apart."""
     return max(1, int(np.sqrt(height * width / _GRID)))
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from shadowtool.core.bands import blocks, channel_sum
 from shadowtool.core.filling import fill_membrane
+from shadowtool.core.lengths import length
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.regions import grown, large_parts, opened
 
@@ -260,7 +261,7 @@ def _slope(gray: Float32) -> Float32:
     smooth = cv2.GaussianBlur(gray, (0, 0), 1.5)
     x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=1 / 8)
     y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=1 / 8)
-    return np.asarray(cv2.magnitude(x, y, magnitude=x), np.float32)
+    return length(x, y, out=x)
 
 
 def _mode(values: Float32) -> float:

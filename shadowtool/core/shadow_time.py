@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shadowtool.core.bands import bands
 from shadowtool.core.crossings import LEAST_CONTRAST, Crossings
 from shadowtool.core.half_floats import rounded, to_float
+from shadowtool.core.lengths import length
 from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plane_fits import Windows, fit_planes
 from shadowtool.core.transfer import LUMA
@@ -261,7 +262,7 @@ def _slope(gray: Float32) -> Float32:
     gray = np.nan_to_num(gray)
     # Differences of neighbours on either side, with nothing of the rows and columns beside them.
     x, y = (cv2.Sobel(gray, cv2.CV_32F, dx, 1 - dx, ksize=1, scale=0.5) for dx in (1, 0))
-    return np.asarray(cv2.magnitude(x, y), np.float32)
+    return length(x, y)
 
 
 def _extremes(
@@ -275,7 +276,7 @@ def _extremes(
     lit_sigma = _sigma(crossings.highest, noise)
     dark_sigma = _sigma(crossings.lowest, noise)
     for sigma, more in zip((dark_sigma, lit_sigma), rough, strict=False):
-        np.sqrt(sigma * sigma + more * more, out=sigma)
+        length(sigma, more, out=sigma)
     beyond = np.float32(_numbers(crossings, noise)[-1])
     lit = crossings.highest - beyond * lit_sigma
     dark = crossings.lowest + beyond * dark_sigma

@@ -5,7 +5,6 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,13 +13,14 @@ from shadowtool.core.bands import overlapping_bands
 from shadowtool.core.camera_motion import displaced
 from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
 from shadowtool.core.exposure import RunningGain, sampled_areas, without_gain
+from shadowtool.core.lengths import length
 from shadowtool.core.noise import (
     NoiseModel,
-    grid_step,
     noise_levels,
     noise_model,
     sample_positions,
     thin,
+    thinning,
 )
 from shadowtool.core.pictures import display, time_picture
 from shadowtool.core.plane_fits import understated
@@ -266,7 +266,7 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
     def seen(position: int) -> _Seen:
         sampled, height, width = position in samples.values(), *footage.header.size[::-1]
         # To be moved, a picture has to be whole.
-        every = 1 if footage.vantage is not None else grid_step(height, width)
+        every = 1 if footage.vantage is not None else thinning(height, width)
         thinned = np.empty((-(-height // every), -(-width // every), 3), np.float32)
         picture = np.empty((height, width, 3), np.uint8) if position == 0 else None
 
@@ -358,7 +358,7 @@ def _times(
     in_shade = loss < SHADE
     own[in_shade], own_error[in_shade] = np.nan, np.inf
     off = misled(duration, loss)
-    cv2.magnitude(own_error, off, own_error)
+    length(own_error, off, out=own_error)
     if (holes := _holes(numbers)).any():
         in_hole = np.append(False, holes)[crossings.at]
         own[in_hole], own_error[in_hole] = np.nan, np.inf
@@ -375,7 +375,7 @@ def _times(
     for _ in ordered_map(refine, overlapping_bands(len(own), windows.reach), jobs):
         pass
     # Neighbours are misled alike: it does not average out.
-    cv2.magnitude(error, off, error)
+    length(error, off, out=error)
     if (np.diff(numbers) != 1).any():
         # From positions among the frames to frame numbers, which are not one apart.
         spacing = np.interp(np.nan_to_num(own), np.arange(len(numbers) - 1) + 0.5, np.diff(numbers))

@@ -496,16 +496,19 @@ def _figures(
     gains: dict[Frame, float],
     bend: Bend,
 ) -> Figures:
-    known = times.time[np.isfinite(times.time)]
+    reached = np.isfinite(times.time)
+    known = times.time[reached]
     beyond = (known < lines.frame[0]) | (known > lines.frame[-1])
-    y, x = some_of(region & np.isfinite(times.time))
+    # The median of some is that of all.
+    errors = times.error[some_of(reached)]
+    y, x = some_of(region & reached)
     pace = line_pace(lines, times.time[y, x], np.stack([x, y], axis=-1))
     turned = math.degrees(float(lines.angle[-1] - lines.angle[0]))
     origins = list(lines.origin)
     return {
         "frames": len(gains),
         "gain": {"least": round(min(gains.values()), 4), "most": round(max(gains.values()), 4)},
-        "reached": round(float(np.isfinite(times.time).mean()), 4),
+        "reached": round(float(reached.mean()), 4),
         "beyond_lines": round(float(beyond.mean()), 4) if beyond.size else 0.0,
         "lines": {
             "first": float(lines.frame[0]),
@@ -518,7 +521,7 @@ def _figures(
         },
         "predicted_error": {
             # Of a time, in frames, and on the plane as far as the edge moves meanwhile.
-            "frames": round(float(np.median(times.error[np.isfinite(times.error)])), 4),
+            "frames": round(float(np.median(errors)), 4),
             "pixels": round(float(np.median(times.error[y, x] * pace)), 3),
         },
         "bend": {"pixels": round(bend.pixels, 2), "certainty": round(min(bend.certainty, 1e6), 1)},

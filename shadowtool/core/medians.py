@@ -1,4 +1,5 @@
-"""Medians by a sort, which takes a third to a seventh of the time of numpy's own."""
+"""Medians of many short rows by a sort, which takes a third to a seventh of the time of numpy's
+own."""
 
 from typing import Any
 
@@ -7,12 +8,20 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating[Any]]
 
+# Of more values than this those in the middle are found faster than the order of all.
+_FEW = 800
+
 
 def median(values: Floats, axis: int = 0) -> Floats:
     """What ``numpy.median`` gives along an axis: NaN where one is, the mean of the middle two."""
-    ordered = np.moveaxis(np.sort(values, axis=axis), axis, 0)
-    count = len(ordered)
-    middle = (ordered[(count - 1) // 2] + ordered[count // 2]) / ordered.dtype.type(2)
+    count = values.shape[axis]
+    below, above = (count - 1) // 2, count // 2
+    if count > _FEW:
+        ordered = np.partition(values, (below, above, count - 1), axis=axis)
+    else:
+        ordered = np.sort(values, axis=axis)
+    ordered = np.moveaxis(ordered, axis, 0)
+    middle = (ordered[below] + ordered[above]) / ordered.dtype.type(2)
     # What is unknown comes last.
     return np.asarray(np.where(np.isnan(ordered[-1]), ordered[-1], middle))
 

@@ -3,8 +3,7 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-COMPILED := shadowtool/core/_crossings.c shadowtool/core/_luminance.c \
-	shadowtool/core/_own_times.c shadowtool/core/_planes.c shadowtool/io/_zip.c
+COMPILED := $(wildcard shadowtool/*/_*.c shadowtool/*/_*.h)
 
 .DEFAULT_GOAL := sample
 .PHONY: sample test bench bench-speed soak format readme clean

@@ -2,11 +2,7 @@
  * crossings.py does, and how it says why, one pixel after the other and without Python in between.
  */
 
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
-#include <stdint.h>
-#include <string.h>
+#include "_arrays.h"
 
 /* The key of NaN, beyond all others; and one below all others. */
 #define UNKNOWN 0x7E00
@@ -41,24 +37,7 @@ static inline int16_t most(int16_t one, int16_t other) { return one > other ? on
 /* The key of a value rounded to a half. */
 static inline int16_t key_of(float value)
 {
-    uint32_t bits, half, sign;
-    memcpy(&bits, &value, 4);
-    sign = bits >> 16 & 0x8000;
-    bits &= 0x7FFFFFFF;
-    if (bits > 0x7F800000) {
-        half = UNKNOWN;
-    } else if (bits >= 0x477FF000) {
-        half = 0x7C00;
-    } else if (bits < 0x38800000) {
-        /* Not normal: to the last place of a half's sum with this half, which is the same. */
-        memcpy(&value, &bits, 4);
-        value += 0.5f;
-        memcpy(&bits, &value, 4);
-        half = bits - 0x3F000000;
-    } else {
-        /* To the nearest, or the even one of two, with the other kind's bias of the exponent. */
-        half = (bits + 0xFFF + (bits >> 13 & 1) - 0x38000000) >> 13;
-    }
+    uint32_t sign, half = bits_of_value(value, &sign);
     /* Halfs are sign and magnitude: see half_keys.py. */
     return (int16_t)(sign ? (half | 0x8000) ^ 0x7FFF : half);
 }
@@ -66,11 +45,8 @@ static inline int16_t key_of(float value)
 /* What a finite half's key stands for. */
 static inline float value_of(int16_t key)
 {
-    uint32_t half = key < 0 ? (uint32_t)key ^ 0x7FFF : (uint32_t)key, bits = (half & 0x7FFF) << 13;
-    float value;
-    memcpy(&value, &bits, 4);
-    /* From one kind's bias of the exponent to the other's. */
-    value *= 0x1p112f;
+    uint32_t half = key < 0 ? (uint32_t)key ^ 0x7FFF : (uint32_t)key;
+    float value = value_of_bits(half & 0x7FFF, 1);
     return key < 0 ? -value : value;
 }
 

@@ -1,55 +1,20 @@
 /* Luminance of half floats: what `luminance_halfs` of shadow_time.py does, in one go. */
 
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
-#include <stdint.h>
-#include <string.h>
+#include "_arrays.h"
 #if defined(__x86_64__) && defined(__GNUC__)
 #define HAS_WIDE
 #include <immintrin.h>
 #endif
 
-/* A half's value. */
 static inline float value_of(uint16_t half)
 {
-    uint32_t bits = (uint32_t)(half & 0x7FFF) << 13, sign = (uint32_t)(half & 0x8000) << 16;
-    float value;
-    if ((half & 0x7C00) == 0x7C00) {
-        bits |= 0x7F800000;
-        memcpy(&value, &bits, 4);
-    } else {
-        memcpy(&value, &bits, 4);
-        /* From one kind's bias of the exponent to the other's. */
-        value *= 0x1p112f;
-        memcpy(&bits, &value, 4);
-    }
-    bits |= sign;
-    memcpy(&value, &bits, 4);
-    return value;
+    float value = value_of_bits(half & 0x7FFF, 0);
+    return half & 0x8000 ? -value : value;
 }
 
-/* A value rounded to a half. */
 static inline uint16_t half_of(float value)
 {
-    uint32_t bits, sign, half;
-    memcpy(&bits, &value, 4);
-    sign = bits >> 16 & 0x8000;
-    bits &= 0x7FFFFFFF;
-    if (bits > 0x7F800000) {
-        half = 0x7E00;
-    } else if (bits >= 0x477FF000) {
-        half = 0x7C00;
-    } else if (bits < 0x38800000) {
-        /* Not normal: to the last place of a half's sum with this half, which is the same. */
-        memcpy(&value, &bits, 4);
-        value += 0.5f;
-        memcpy(&bits, &value, 4);
-        half = bits - 0x3F000000;
-    } else {
-        /* To the nearest, or the even one of two, with the other kind's bias of the exponent. */
-        half = (bits + 0xFFF + (bits >> 13 & 1) - 0x38000000) >> 13;
-    }
+    uint32_t sign, half = bits_of_value(value, &sign);
     return (uint16_t)(sign | half);
 }
 
@@ -103,46 +68,41 @@ static void luminance(const row_t *row, Py_ssize_t width, int wide)
 static PyObject *py_luminance(PyObject *module, PyObject *arguments)
 {
     PyObject *arrays[4];
-    Py_buffer views[4];
+    const Py_buffer *views[4];
+    held_t held = {0};
     row_t row;
-    int held = 0, wide = 0;
+    int fit = 1, wide = 0;
     (void)module;
     if (!PyArg_ParseTuple(arguments, "OOOOfff", arrays, arrays + 1, arrays + 2, arrays + 3,
                           row.weights, row.weights + 1, row.weights + 2))
         return NULL;
-    while (held < 4) {
-        int flags = PyBUF_STRIDES | (held == 3 ? PyBUF_WRITABLE : 0);
-        if (PyObject_GetBuffer(arrays[held], views + held, flags))
-            break;
-        const Py_buffer *own = views + held++;
-        if (own->ndim != 2 || own->itemsize != 2 || own->strides[1] != 2 ||
-            own->shape[0] != views->shape[0] || own->shape[1] != views->shape[1]) {
-            PyErr_SetString(PyExc_ValueError, "no rows of halfs, or not as many");
-            break;
-        }
+    for (int part = 0; part < 4; part++) {
+        int flags = PyBUF_STRIDES | (part == 3 ? PyBUF_WRITABLE : 0);
+        views[part] = hold(&held, arrays[part], 2, flags);
+        fit = fit && views[part] && views[part]->ndim == 2 && views[part]->strides[1] == 2 &&
+              alike(views[part], views[0]);
     }
-    if (!PyErr_Occurred()) {
+    if (!fit && !PyErr_Occurred())
+        PyErr_SetString(PyExc_ValueError, "rows that are no rows, or not as many");
+    if (fit) {
+        Py_ssize_t height = views[0]->shape[0], width = views[0]->shape[1];
 #ifdef HAS_WIDE
         wide = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("f16c");
 #endif
         Py_BEGIN_ALLOW_THREADS
-        for (Py_ssize_t y = 0; y < views->shape[0]; y++) {
-            const char *starts[4];
+        for (Py_ssize_t y = 0; y < height; y++) {
+            char *starts[4];
             for (int part = 0; part < 4; part++)
-                starts[part] = (const char *)views[part].buf + y * views[part].strides[0];
+                starts[part] = (char *)views[part]->buf + y * views[part]->strides[0];
             row.red = (const uint16_t *)starts[0];
             row.green = (const uint16_t *)starts[1];
             row.blue = (const uint16_t *)starts[2];
             row.out = (uint16_t *)starts[3];
-            luminance(&row, views->shape[1], wide);
+            luminance(&row, width, wide);
         }
         Py_END_ALLOW_THREADS
     }
-    while (held > 0)
-        PyBuffer_Release(&views[--held]);
-    if (PyErr_Occurred())
-        return NULL;
-    Py_RETURN_NONE;
+    return let_go(&held);
 }
 
 static PyMethodDef methods[] = {

@@ -1,10 +1,7 @@
 /* What `_caught` and `_told` of shadow_time.py do, a few hundred pixels after the other. */
 
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+#include "_arrays.h"
 #include <math.h>
-#include <stdint.h>
 
 /* So many pixels are worked on together, each step in a loop of its own, which lets the compiler
  * take several at a time. */
@@ -14,7 +11,6 @@
 
 /* What comes in, (P,) each; the roughness of both ends may be missing. */
 enum { AT, BEFORE, AFTER, LOWEST, HIGHEST, DARK_ROUGH, LIT_ROUGH, CROSSING };
-static const Py_ssize_t SIZES[CROSSING] = {4, 4, 4, 4, 4, 4, 4};
 
 /* Variance of the noise is slope times light and floor; its extremes lie so many standard
  * deviations beyond what was lit and dark. */
@@ -39,7 +35,7 @@ static void sigmas(const float *gray, const float *rough, const noise_t *noise, 
             sigma[at] = sqrtf(sigma[at] * sigma[at] + rough[at] * rough[at]);
 }
 
-static void find_extremes(const void *const *parts, Py_ssize_t start, Py_ssize_t count,
+static void find_extremes(void *const *parts, Py_ssize_t start, Py_ssize_t count,
                           const noise_t *noise, extremes_t *found)
 {
     const float *lowest = (const float *)parts[LOWEST] + start;
@@ -87,7 +83,7 @@ typedef struct {
     int64_t *counts;
 } caught_t;
 
-static void catch(const void *const *parts, Py_ssize_t start, Py_ssize_t count,
+static void catch(void *const *parts, Py_ssize_t start, Py_ssize_t count,
                   const noise_t *noise, float enough, float chosen, const caught_t *caught)
 {
     extremes_t ends;
@@ -144,7 +140,7 @@ static void take(const float *part, const float *other, const float *told, const
     }
 }
 
-static void tell(const void *const *parts, Py_ssize_t start, Py_ssize_t count,
+static void tell(void *const *parts, Py_ssize_t start, Py_ssize_t count,
                  const noise_t *noise, const edge_t *edge, const float *lost, const float *left,
                  const float *duration, float *time, float *error)
 {
@@ -190,62 +186,48 @@ static void tell(const void *const *parts, Py_ssize_t start, Py_ssize_t count,
     }
 }
 
-/* Hold arrays of so many bytes an item, all with as many items; None, where it may be, is NULL.
- * How many are held; fewer, with an error set, if something is wrong. */
-static int hold(PyObject *arrays, const Py_ssize_t *sizes, int wanted, int writable,
-                Py_buffer *views, const void **parts, Py_ssize_t *count)
+/* Hold arrays of 4 bytes an item and as many items, which are counted at the first; None, where
+ * it may be, is NULL. Whether they are what is wanted; if not, an error is set. */
+static int hold_all(held_t *held, PyObject *arrays, int wanted, int flags, void **parts,
+                    Py_ssize_t *count)
 {
-    int held = 0;
-    if (PyTuple_Size(arrays) != wanted) {
+    if (PyTuple_Size(arrays) != wanted)
         PyErr_SetString(PyExc_ValueError, "not as many arrays");
-        return 0;
-    }
-    for (int index = 0; index < wanted; index++) {
+    for (int index = 0; index < wanted && !PyErr_Occurred(); index++) {
         PyObject *item = PyTuple_GetItem(arrays, index);
         parts[index] = NULL;
         if (item == Py_None && (index == DARK_ROUGH || index == LIT_ROUGH))
             continue;
-        if (PyObject_GetBuffer(item, views + held,
-                               PyBUF_C_CONTIGUOUS | (writable ? PyBUF_WRITABLE : 0)))
-            return held;
-        Py_buffer *own = views + held++;
-        Py_ssize_t items = own->len / sizes[index];
-        if (own->itemsize != sizes[index] || (*count >= 0 && items != *count)) {
-            PyErr_SetString(PyExc_ValueError, "arrays of another type, or not as large");
-            return held;
-        }
-        *count = items;
+        const Py_buffer *own = hold(held, item, 4, PyBUF_C_CONTIGUOUS | flags);
+        if (own && *count >= 0 && own->len != 4 * *count)
+            PyErr_SetString(PyExc_ValueError, "arrays that are not as large");
+        if (!own || PyErr_Occurred())
+            break;
+        *count = own->len / 4;
         parts[index] = own->buf;
     }
-    return held;
+    return !PyErr_Occurred();
 }
 
 static PyObject *py_catch(PyObject *module, PyObject *arguments)
 {
     PyObject *crossings, *found, *counts;
-    Py_buffer views[CROSSING + 3], counted;
-    const void *parts[CROSSING], *outs[3];
-    static const Py_ssize_t sizes[3] = {4, 4, 4};
+    held_t held = {0};
+    void *parts[CROSSING], *outs[3];
     Py_ssize_t count = -1;
     noise_t noise;
     float enough, chosen;
-    int held = 0, counting = 0;
     (void)module;
     if (!PyArg_ParseTuple(arguments, "O!O!Offfff", &PyTuple_Type, &crossings, &PyTuple_Type,
                           &found, &counts, &noise.slope, &noise.floor, &noise.beyond, &enough,
                           &chosen))
         return NULL;
-    held = hold(crossings, SIZES, CROSSING, 0, views, parts, &count);
-    if (!PyErr_Occurred())
-        held += hold(found, sizes, 3, 1, views + held, outs, &count);
-    if (!PyErr_Occurred() &&
-        !PyObject_GetBuffer(counts, &counted, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) {
-        counting = 1;
-        if (counted.len != 2 * BINS * 8)
-            PyErr_SetString(PyExc_ValueError, "not as many counts");
-    }
-    if (!PyErr_Occurred()) {
-        caught_t caught = {(float *)outs[0], (float *)outs[1], (float *)outs[2], counted.buf};
+    const Py_buffer *counted = hold(&held, counts, 8, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE);
+    if (counted && counted->len != 8 * 2 * BINS)
+        PyErr_SetString(PyExc_ValueError, "not as many counts");
+    if (counted && hold_all(&held, crossings, CROSSING, 0, parts, &count) &&
+        hold_all(&held, found, 3, PyBUF_WRITABLE, outs, &count)) {
+        caught_t caught = {outs[0], outs[1], outs[2], counted->buf};
         Py_BEGIN_ALLOW_THREADS
         for (Py_ssize_t start = 0; start < count; start += TOGETHER) {
             Py_ssize_t own = count - start < TOGETHER ? count - start : TOGETHER;
@@ -253,39 +235,28 @@ static PyObject *py_catch(PyObject *module, PyObject *arguments)
         }
         Py_END_ALLOW_THREADS
     }
-    if (counting)
-        PyBuffer_Release(&counted);
-    while (held > 0)
-        PyBuffer_Release(&views[--held]);
-    if (PyErr_Occurred())
-        return NULL;
-    Py_RETURN_NONE;
+    return let_go(&held);
 }
 
 static PyObject *py_tell(PyObject *module, PyObject *arguments)
 {
     PyObject *crossings, *caught, *found;
-    Py_buffer views[CROSSING + 5];
-    const void *parts[CROSSING], *ins[3], *outs[2];
-    static const Py_ssize_t sizes[3] = {4, 4, 4};
+    held_t held = {0};
+    void *parts[CROSSING], *ins[3], *outs[2];
     Py_ssize_t count = -1;
     noise_t noise;
     edge_t edge;
-    int held = 0;
     (void)module;
     if (!PyArg_ParseTuple(arguments, "O!O!O!fffffffff", &PyTuple_Type, &crossings, &PyTuple_Type,
                           &caught, &PyTuple_Type, &found, &noise.slope, &noise.floor,
                           &noise.beyond, &edge.profile, &edge.least, &edge.least_between,
                           &edge.interval, &edge.sharp, &edge.soft))
         return NULL;
-    held = hold(crossings, SIZES, CROSSING, 0, views, parts, &count);
-    if (!PyErr_Occurred())
-        held += hold(caught, sizes, 3, 0, views + held, ins, &count);
-    if (!PyErr_Occurred())
-        held += hold(found, sizes, 2, 1, views + held, outs, &count);
-    if (!PyErr_Occurred()) {
+    if (hold_all(&held, crossings, CROSSING, 0, parts, &count) &&
+        hold_all(&held, caught, 3, 0, ins, &count) &&
+        hold_all(&held, found, 2, PyBUF_WRITABLE, outs, &count)) {
         const float *lost = ins[0], *left = ins[1], *duration = ins[2];
-        float *time = (float *)outs[0], *error = (float *)outs[1];
+        float *time = outs[0], *error = outs[1];
         Py_BEGIN_ALLOW_THREADS
         for (Py_ssize_t start = 0; start < count; start += TOGETHER) {
             Py_ssize_t own = count - start < TOGETHER ? count - start : TOGETHER;
@@ -294,11 +265,7 @@ static PyObject *py_tell(PyObject *module, PyObject *arguments)
         }
         Py_END_ALLOW_THREADS
     }
-    while (held > 0)
-        PyBuffer_Release(&views[--held]);
-    if (PyErr_Occurred())
-        return NULL;
-    Py_RETURN_NONE;
+    return let_go(&held);
 }
 
 static PyMethodDef methods[] = {

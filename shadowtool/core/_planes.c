@@ -1,10 +1,7 @@
 /* What `_trusted`, `_moments` and `_choose` of plane_fits.py do, row after row. */
 
-#define PY_SSIZE_T_CLEAN
-#define Py_LIMITED_API 0x030B0000
-#include <Python.h>
+#include "_arrays.h"
 #include <math.h>
-#include <stdint.h>
 #include <stdlib.h>
 
 /* Add to the counts of two rows where a measurement and the one dx further on in the other row
@@ -151,8 +148,8 @@ enum { VALUE = PLANES, VARIANCE, LEAST, MOST, ALL };
 
 typedef struct {
     float *parts[ALL];
-    /* Of the choice, and of the rows that were fitted. */
-    Py_ssize_t rows, width, height;
+    /* Of the rows that were fitted. */
+    Py_ssize_t width, height;
     /* Pixels to a cell; from a window's middle to its neighbours'; the choice's first row among
      * those fitted. */
     Py_ssize_t size, radius, first;
@@ -238,122 +235,56 @@ static void choose_row(const choice_t *choice, const lines_t *lines, Py_ssize_t 
     }
 }
 
-static PyObject *py_choose(PyObject *module, PyObject *arguments)
-{
-    PyObject *planes, *chosen;
-    Py_buffer views[ALL];
-    choice_t choice;
-    int held = 0;
-    float *room = NULL;
-    (void)module;
-    if (!PyArg_ParseTuple(arguments, "O!O!nnnnf", &PyTuple_Type, &planes, &PyTuple_Type, &chosen,
-                          &choice.height, &choice.size, &choice.radius, &choice.first,
-                          &choice.agrees))
-        return NULL;
-    if (PyTuple_Size(planes) != PLANES || PyTuple_Size(chosen) != ALL - PLANES ||
-        choice.height < 0 || choice.size < 1 || choice.radius < 1)
-        PyErr_SetString(PyExc_ValueError, "no planes, or none to choose");
-    while (!PyErr_Occurred() && held < ALL) {
-        PyObject *item =
-            held < PLANES ? PyTuple_GetItem(planes, held) : PyTuple_GetItem(chosen, held - PLANES);
-        int writable = held == VALUE || held == VARIANCE;
-        if (PyObject_GetBuffer(item, views + held,
-                               PyBUF_C_CONTIGUOUS | (writable ? PyBUF_WRITABLE : 0)))
-            break;
-        const Py_buffer *own = views + held, *first = views + (held < PLANES ? A : VALUE);
-        if (own->ndim != 2 || own->itemsize != 4 || own->shape[0] != first->shape[0] ||
-            own->shape[1] != views->shape[1])
-            PyErr_SetString(PyExc_ValueError, "parts are no pictures of one size");
-        choice.parts[held++] = own->buf;
-    }
-    if (!PyErr_Occurred()) {
-        choice.rows = views[VALUE].shape[0];
-        choice.width = views->shape[1];
-        if ((choice.height + choice.size - 1) / choice.size > views->shape[0])
-            PyErr_SetString(PyExc_ValueError, "planes of fewer cells than were fitted");
-        else if (!(room = malloc((size_t)(5 * choice.width + 1) * sizeof *room)))
-            PyErr_NoMemory();
-    }
-    if (room) {
-        lines_t lines = {room, room + choice.width, room + 2 * choice.width,
-                         room + 3 * choice.width, room + 4 * choice.width};
-        Py_BEGIN_ALLOW_THREADS
-        for (Py_ssize_t row = 0; row < choice.rows; row++)
-            choose_row(&choice, &lines, row);
-        Py_END_ALLOW_THREADS
-    }
-    free(room);
-    while (held > 0)
-        PyBuffer_Release(&views[--held]);
-    if (PyErr_Occurred())
-        return NULL;
-    Py_RETURN_NONE;
-}
-
 static PyObject *py_trust(PyObject *module, PyObject *arguments)
 {
     PyObject *arrays[3];
-    Py_buffer views[3];
-    int held = 0, least;
+    held_t held = {0};
+    int least;
     float near;
     int32_t *room = NULL;
     (void)module;
     if (!PyArg_ParseTuple(arguments, "OOOfi", arrays, arrays + 1, arrays + 2, &near, &least))
         return NULL;
-    while (held < 3 && !PyErr_Occurred()) {
-        if (PyObject_GetBuffer(arrays[held], views + held,
-                               PyBUF_C_CONTIGUOUS | (held == 2 ? PyBUF_WRITABLE : 0)))
-            break;
-        const Py_buffer *own = views + held++;
-        if (own->ndim != 2 || own->itemsize != (held == 3 ? 1 : 4) ||
-            own->shape[0] != views->shape[0] || own->shape[1] != views->shape[1])
-            PyErr_SetString(PyExc_ValueError, "no pictures of one size");
-    }
-    if (!PyErr_Occurred()) {
-        Py_ssize_t height = views->shape[0], width = views->shape[1];
+    const Py_buffer *value = hold(&held, arrays[0], 4, PyBUF_C_CONTIGUOUS);
+    const Py_buffer *allowed = hold(&held, arrays[1], 4, PyBUF_C_CONTIGUOUS);
+    const Py_buffer *trusted = hold(&held, arrays[2], 1, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE);
+    if (trusted && (value->ndim != 2 || !alike(allowed, value) || !alike(trusted, value))) {
+        PyErr_SetString(PyExc_ValueError, "no pictures of one size");
+    } else if (trusted) {
+        Py_ssize_t height = value->shape[0], width = value->shape[1];
         if ((room = malloc((size_t)(3 * width + 1) * sizeof *room))) {
             Py_BEGIN_ALLOW_THREADS
-            trust(views[0].buf, views[1].buf, views[2].buf, height, width, near, least, room);
+            trust(value->buf, allowed->buf, trusted->buf, height, width, near, least, room);
             Py_END_ALLOW_THREADS
         } else {
             PyErr_NoMemory();
         }
     }
     free(room);
-    while (held > 0)
-        PyBuffer_Release(&views[--held]);
-    if (PyErr_Occurred())
-        return NULL;
-    Py_RETURN_NONE;
+    return let_go(&held);
 }
 
 static PyObject *py_add_up(PyObject *module, PyObject *arguments)
 {
     PyObject *arrays[3];
-    Py_buffer views[3];
-    int held = 0, size;
+    held_t held = {0};
+    int size;
     double *room = NULL;
     (void)module;
     if (!PyArg_ParseTuple(arguments, "OOOi", arrays, arrays + 1, arrays + 2, &size))
         return NULL;
-    if (size != 2 && size != 4)
-        PyErr_SetString(PyExc_ValueError, "cells of another size");
-    while (held < 3 && !PyErr_Occurred()) {
-        if (PyObject_GetBuffer(arrays[held], views + held,
-                               PyBUF_C_CONTIGUOUS | (held == 2 ? PyBUF_WRITABLE : 0)))
-            break;
-        const Py_buffer *own = views + held++;
-        int whole = own->itemsize == 8 && own->ndim == (held == 3 ? 3 : 2);
-        for (int side = 0; whole && side < 2; side++) {
-            Py_ssize_t length = views->shape[side], cells = length / size + (length % size > 0);
-            whole = held == 3 ? own->shape[1 + side] == cells : own->shape[side] == length;
-        }
-        if (!whole || (held == 3 && own->shape[0] != MOMENTS))
-            PyErr_SetString(PyExc_ValueError, "no pictures of one size, or not as many cells");
+    const Py_buffer *value = hold(&held, arrays[0], 8, PyBUF_C_CONTIGUOUS);
+    const Py_buffer *weight = hold(&held, arrays[1], 8, PyBUF_C_CONTIGUOUS);
+    const Py_buffer *moments = hold(&held, arrays[2], 8, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE);
+    int fit = moments && (size == 2 || size == 4) && value->ndim == 2 && alike(weight, value) &&
+              moments->ndim == 3 && moments->shape[0] == MOMENTS;
+    for (int side = 0; fit && side < 2; side++) {
+        Py_ssize_t length = value->shape[side];
+        fit = moments->shape[1 + side] == length / size + (length % size > 0);
     }
-    if (!PyErr_Occurred()) {
-        cells_t cells = {views[0].buf, views[1].buf, views->shape[0], views->shape[1],
-                         views[2].buf, views[2].shape[1], views[2].shape[2]};
+    if (fit) {
+        cells_t cells = {value->buf, weight->buf, value->shape[0], value->shape[1],
+                         moments->buf, moments->shape[1], moments->shape[2]};
         size_t count = (size_t)((DOWN + 1) * cells.columns * size + 1);
         if ((room = calloc(count, sizeof *room))) {
             Py_BEGIN_ALLOW_THREADS
@@ -365,13 +296,55 @@ static PyObject *py_add_up(PyObject *module, PyObject *arguments)
         } else {
             PyErr_NoMemory();
         }
+    } else if (moments) {
+        PyErr_SetString(PyExc_ValueError, "no pictures of one size, or not as many cells");
     }
     free(room);
-    while (held > 0)
-        PyBuffer_Release(&views[--held]);
-    if (PyErr_Occurred())
+    return let_go(&held);
+}
+
+static PyObject *py_choose(PyObject *module, PyObject *arguments)
+{
+    PyObject *planes, *chosen;
+    held_t held = {0};
+    choice_t choice;
+    float *room = NULL;
+    int fit;
+    (void)module;
+    if (!PyArg_ParseTuple(arguments, "O!O!nnnnf", &PyTuple_Type, &planes, &PyTuple_Type, &chosen,
+                          &choice.height, &choice.size, &choice.radius, &choice.first,
+                          &choice.agrees))
         return NULL;
-    Py_RETURN_NONE;
+    fit = PyTuple_Size(planes) == PLANES && PyTuple_Size(chosen) == ALL - PLANES &&
+          choice.height >= 0 && choice.size > 0 && choice.radius > 0;
+    for (int part = 0; fit && part < ALL; part++) {
+        PyObject *item =
+            part < PLANES ? PyTuple_GetItem(planes, part) : PyTuple_GetItem(chosen, part - PLANES);
+        int writable = part == VALUE || part == VARIANCE ? PyBUF_WRITABLE : 0;
+        const Py_buffer *own = hold(&held, item, 4, PyBUF_C_CONTIGUOUS | writable);
+        fit = own && own->ndim == 2 && alike(own, held.views + (part < PLANES ? A : VALUE));
+        choice.parts[part] = own ? own->buf : NULL;
+    }
+    const Py_buffer *first = held.views + A, *value = held.views + VALUE;
+    fit = fit && value->shape[1] == first->shape[1] &&
+          (choice.height + choice.size - 1) / choice.size <= first->shape[0];
+    if (!fit && !PyErr_Occurred())
+        PyErr_SetString(PyExc_ValueError, "planes or a choice that don't fit together");
+    if (fit) {
+        Py_ssize_t width = choice.width = first->shape[1];
+        if ((room = malloc((size_t)(5 * width + 1) * sizeof *room))) {
+            lines_t lines = {room, room + width, room + 2 * width, room + 3 * width,
+                             room + 4 * width};
+            Py_BEGIN_ALLOW_THREADS
+            for (Py_ssize_t row = 0; row < value->shape[0]; row++)
+                choose_row(&choice, &lines, row);
+            Py_END_ALLOW_THREADS
+        } else {
+            PyErr_NoMemory();
+        }
+    }
+    free(room);
+    return let_go(&held);
 }
 
 static PyMethodDef methods[] = {

@@ -125,7 +125,7 @@ def test_arrays_that_do_not_belong_together_tell_no_times():
         {"counts": 49},
         {"parts": 6},
     ):
-        with pytest.raises(ValueError, match="not as"):
+        with pytest.raises(ValueError, match=r"not as|another type"):
             told(**wrong)
     with pytest.raises(TypeError):
         shadow_time._own_times.catch((None,) * 7, (), None, 1, 1, 1, 1, 1)
@@ -145,7 +145,7 @@ def test_luminance_is_rounded_to_halfs_once(kinds):
 def test_the_compiled_luminance_takes_nothing_but_rows_of_halfs():
     halfs = np.ones((4, 6), np.float16)
     for wrong in (halfs[:, :5], halfs[:3], halfs[:, ::2], halfs.astype("f4"), halfs.ravel()):
-        with pytest.raises(ValueError, match="no rows of halfs"):
+        with pytest.raises(ValueError, match=r"no rows|another type"):
             shadow_time._luminance.luminance(halfs, halfs, wrong, halfs.copy(), 1, 1, 1)
     frozen = halfs.copy()
     frozen.flags.writeable = False

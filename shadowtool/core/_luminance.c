@@ -1,7 +1,8 @@
 /* Luminance of half floats: what `luminance_halfs` of shadow_time.py does, in one go. */
 
 #include "_arrays.h"
-#if defined(__x86_64__) && defined(__GNUC__)
+/* Older compilers can't ask for what is needed. */
+#if defined(__x86_64__) && (defined(__clang__) ? __clang_major__ >= 18 : __GNUC__ >= 11)
 #define HAS_WIDE
 #include <immintrin.h>
 #endif
@@ -108,7 +109,7 @@ static PyObject *py_luminance(PyObject *module, PyObject *arguments)
 static PyMethodDef methods[] = {
     {"luminance", py_luminance, METH_VARARGS,
      "luminance(red, green, blue, out, of_red, of_green, of_blue)\n\n"
-     "Sums of halfs, (H, W) each, rows of which may lie apart, by their weights."},
+     "Write to out the sums of halfs by their weights, (H, W) each; rows may lie apart."},
     {NULL, NULL, 0, NULL},
 };
 

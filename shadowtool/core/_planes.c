@@ -250,7 +250,7 @@ static PyObject *py_trust(PyObject *module, PyObject *arguments)
     const Py_buffer *trusted = hold(&held, arrays[2], 1, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE);
     if (trusted && (value->ndim != 2 || !alike(allowed, value) || !alike(trusted, value))) {
         PyErr_SetString(PyExc_ValueError, "no pictures of one size");
-    } else if (trusted) {
+    } else if (trusted && value->len) {
         Py_ssize_t height = value->shape[0], width = value->shape[1];
         if ((room = malloc((size_t)(3 * width + 1) * sizeof *room))) {
             Py_BEGIN_ALLOW_THREADS
@@ -282,7 +282,7 @@ static PyObject *py_add_up(PyObject *module, PyObject *arguments)
         Py_ssize_t length = value->shape[side];
         fit = moments->shape[1 + side] == length / size + (length % size > 0);
     }
-    if (fit) {
+    if (fit && value->len) {
         cells_t cells = {value->buf, weight->buf, value->shape[0], value->shape[1],
                          moments->buf, moments->shape[1], moments->shape[2]};
         size_t count = (size_t)((DOWN + 1) * cells.columns * size + 1);
@@ -296,7 +296,7 @@ static PyObject *py_add_up(PyObject *module, PyObject *arguments)
         } else {
             PyErr_NoMemory();
         }
-    } else if (moments) {
+    } else if (moments && !fit) {
         PyErr_SetString(PyExc_ValueError, "no pictures of one size, or not as many cells");
     }
     free(room);
@@ -316,7 +316,8 @@ static PyObject *py_choose(PyObject *module, PyObject *arguments)
                           &choice.agrees))
         return NULL;
     fit = PyTuple_Size(planes) == PLANES && PyTuple_Size(chosen) == ALL - PLANES &&
-          choice.height >= 0 && choice.size > 0 && choice.radius > 0;
+          choice.height >= 0 && choice.size > 0 && choice.radius > 0 &&
+          choice.radius <= INT32_MAX && choice.first >= 0 && choice.first <= INT32_MAX;
     for (int part = 0; fit && part < ALL; part++) {
         PyObject *item =
             part < PLANES ? PyTuple_GetItem(planes, part) : PyTuple_GetItem(chosen, part - PLANES);
@@ -327,10 +328,10 @@ static PyObject *py_choose(PyObject *module, PyObject *arguments)
     }
     const Py_buffer *first = held.views + A, *value = held.views + VALUE;
     fit = fit && value->shape[1] == first->shape[1] &&
-          (choice.height + choice.size - 1) / choice.size <= first->shape[0];
+          choice.height / choice.size + (choice.height % choice.size > 0) <= first->shape[0];
     if (!fit && !PyErr_Occurred())
         PyErr_SetString(PyExc_ValueError, "planes or a choice that don't fit together");
-    if (fit) {
+    if (fit && first->len && value->len) {
         Py_ssize_t width = choice.width = first->shape[1];
         if ((room = malloc((size_t)(5 * width + 1) * sizeof *room))) {
             lines_t lines = {room, room + width, room + 2 * width, room + 3 * width,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from shadowtool.core.bands import bands
 
 try:
+    # There is a function of that name here.
     from shadowtool.core import _planes as _compiled
 except ImportError:
     # No compiler was there when this was installed.
@@ -111,6 +112,7 @@ def fit_planes(
         Value and predicted error, (H, W) float32 each, of the rows wanted; NaN and infinite where
         the value was unknown. A lone measurement that no neighbour agrees with is replaced.
     """
+    value, error = (np.ascontiguousarray(part, np.float32) for part in (value, error))
     known, variance = _known(value, error)
     trusted = _trusted(value, known, variance, windows.near)
     measured, weight = (np.empty(value.shape) for _ in range(2))
@@ -410,9 +412,9 @@ def _moments(value: Float64, weight: Float64, size: int) -> list[Moments]:
     """Sums of the `_images` over each cell, x and y counted from its middle in pixels."""
     height, width = (-(-length // size) for length in value.shape)
     if _compiled is not None:
-        planes = np.empty((sum(map(len, _POWERS)), height, width))
-        _compiled.add_up(value, weight, planes, size)
-        every = iter(planes)
+        moments = np.empty((sum(map(len, _POWERS)), height, width))
+        _compiled.add_up(value, weight, moments, size)
+        every = iter(moments)
         return [{power: next(every) for power in powers} for powers in _POWERS]
     sums: list[Moments] = []
     for rows in bands((height, size * value.shape[1])):

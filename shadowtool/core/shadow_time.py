@@ -20,11 +20,15 @@ from shadowtool.core.noise import NoiseModel, extreme_range
 from shadowtool.core.plane_fits import Windows, fit_planes
 from shadowtool.core.transfer import LUMA
 
+# No compiler was there when this was installed, or none that knows what they need.
 try:
-    from shadowtool.core import _luminance, _own_times
+    from shadowtool.core import _luminance
 except ImportError:
-    # No compiler was there when this was installed.
-    _luminance = _own_times = None  # type: ignore[assignment]
+    _luminance = None  # type: ignore[assignment]
+try:
+    from shadowtool.core import _own_times
+except ImportError:
+    _own_times = None  # type: ignore[assignment]
 
 Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
@@ -112,7 +116,10 @@ def luminance_halfs(
     """
     gray = np.empty(red.shape, np.float16) if out is None else out
     channels, weights = (red, green, blue), LUMA.tolist()
-    halfs = all(channel.dtype == np.float16 and channel.strides[1] == 2 for channel in channels)
+    halfs = all(
+        part.dtype == np.float16 and part.strides[1] == 2 and part.shape == gray.shape
+        for part in (*channels, gray)
+    )
     if _luminance is not None and halfs and sys.byteorder == "little":
         _luminance.luminance(*channels, gray, *weights)
         return gray
@@ -235,15 +242,16 @@ def _caught(
             np.multiply(seen, known & (seen > _CAUGHT * sigma), out=values[rows])
         noise_alone = chosen * (sigmas[0] + sigmas[1])
         between = np.fmax((part.before - part.after) / contrast, 0) ** 2 - noise_alone**2
-        # Of what was never known, NaN; in a mean it would spread.
-        fall[rows] = np.where(known, np.sqrt(np.maximum(between, 0)), np.float32(0))
+        # What is not known is nothing; in a mean NaN would spread.
+        fall[rows] = np.where(known, np.sqrt(np.fmax(between, 0)), np.float32(0))
     return found, counts
 
 
 def _parts(crossings: Crossings, rough: list[Float32]) -> tuple[NDArray[Any] | None, ...]:
     """Crossings as the compiled functions take them."""
-    at, before, after, lowest, highest = crossings[:5]
-    return at, before, after, lowest, highest, *(rough or (None, None))
+    at, *lights = crossings[:5]
+    singles = [np.ascontiguousarray(light, np.float32) for light in (*lights, *rough)]
+    return np.ascontiguousarray(at, np.int32), *singles, *([] if rough else [None, None])
 
 
 def _numbers(crossings: Crossings, noise: NoiseModel) -> tuple[float, float, float]:

@@ -145,20 +145,20 @@ static void arrange(const uint8_t *bytes, uint8_t *sorted, Py_ssize_t size)
 /* OpenEXR's exr_compress_buffer: context, level, source, target, and how much came of it. */
 typedef int32_t (*deflate_t)(const void *, int, const void *, size_t, void *, size_t, size_t *);
 
-/* Deflate rows, and note where in the target each chunk starts: the end of the last; -1 if it could
- * not be done. What deflating makes no smaller is stored as it is. */
+/* Deflate rows, and note where in the target each chunk starts: the end of the last; -1 if there is
+ * no room for them, or for where they start. What deflating makes no smaller is stored as it is. */
 static Py_ssize_t zip(deflate_t deflate, int level, const Py_buffer *source, Py_buffer *target,
                       Py_ssize_t place, Py_buffer *table, const layout_t *layout, uint8_t *scratch)
 {
     const uint8_t *rows = source->buf;
     uint8_t *file = target->buf;
     Py_ssize_t chunks = table->len / 8, size = layout->rows * layout->length, chunk;
-    for (chunk = 0; chunk < chunks && chunk * size < source->len; chunk++) {
+    for (chunk = 0; chunk * size < source->len; chunk++) {
         Py_ssize_t left = source->len - chunk * size, own = left < size ? left : size;
         uint64_t start = (uint64_t)place;
         int32_t number = (int32_t)(layout->top + chunk * layout->rows), stored = (int32_t)own;
         size_t deflated = 0;
-        if (target->len - place < 8 + own)
+        if (chunk == chunks || target->len - place < 8 + own)
             return -1;
         arrange(rows + chunk * size, scratch, own);
         place += 8;
@@ -182,6 +182,10 @@ static uint8_t *room_for(const layout_t *layout, Py_ssize_t there)
 {
     if (layout->rows < 1 || layout->length < 1) {
         PyErr_SetString(PyExc_ValueError, "chunks without rows, or rows without bytes");
+        return NULL;
+    }
+    if (layout->length > PY_SSIZE_T_MAX / layout->rows) {
+        PyErr_SetString(PyExc_ValueError, "chunks of more bytes than there are");
         return NULL;
     }
     Py_ssize_t size = layout->rows * layout->length;
@@ -254,7 +258,7 @@ static PyMethodDef methods[] = {
      "bytes, so many of them from each chunk; the first has the number top."},
     {"zip", py_zip, METH_VARARGS,
      "zip(deflate, level, source, target, place, table, top, rows, length): the place after the\n"
-     "last chunk, -1 if target has no room for them, or there is no memory.\n\n"
+     "last chunk, -1 if target or table has no room for them, or there is no memory.\n\n"
      "deflate is the address of OpenEXR's exr_compress_buffer. source holds rows of so many bytes,\n"
      "of which so many go to each chunk; the first has the number top. Chunks are written to target\n"
      "from a place on, and where each starts to table, as uint64."},

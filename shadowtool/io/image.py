@@ -47,7 +47,7 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _ATTRIBUTE = "shadowtool."
 # Of a grey picture R, G and B differ by no more than this, which rounding explains.
 _COLOURED = 1 / 32
-# ZIP levels: OpenEXR's own, and the least that compresses.
+# ZIP levels: what OpenEXR takes by itself, and the least that compresses.
 _USUAL, _QUICK = 4, 1
 # What OpenEXR raises for headers that make no sense; ZeroDivisionError is a rational number's.
 _EXR_FAULTS = (RuntimeError, ValueError, TypeError, ArithmeticError)
@@ -120,8 +120,9 @@ class Image:
 
     def colours(self, transfer: str = "auto") -> tuple[NDArray[np.floating], ...]:
         """The three channels of `rgb`, (H, W) each."""
-        stored = [self.layers[name] for name in "RGB" if set("RGB") <= self.layers.keys()]
-        if not stored:
+        if set("RGB") <= self.layers.keys():
+            stored = [self.layers[name] for name in "RGB"]
+        else:
             values = _three_channels(self.layers[self._colour_layer()])
             stored = [_one_channel(values, index) for index in range(3)]
         return tuple(decode(values, resolve_transfer(transfer, self.path)) for values in stored)
@@ -397,11 +398,14 @@ def encode_exr(
         RetryError: there is no memory for it.
     """
     arrays = {}
+    height, width = next(iter(channels.values())).shape[:2]
     for name, values in channels.items():
         if values.dtype not in (np.float16, np.float32):
             raise TypeError(f"channel {name} of {path} is {values.dtype}, not half or float")
+        together = (len(name),) if name in ("RGB", "RGBA") else ()
+        if values.shape not in ((height, width), (height, width, *together)):
+            raise TypeError(f"channel {name} of {path} is of another shape, {values.shape}")
         arrays[name] = np.ascontiguousarray(values)
-    height, width = next(iter(arrays.values())).shape[:2]
     first = np.array((0, 0) if header is None else header.origin, np.int32)
     window = first, first + np.array([width - 1, height - 1], np.int32)
     attributes: dict[str, Any] = {
@@ -428,7 +432,7 @@ def encode_exr(
         with _zip_level.at(level):
             return _encoded(attributes, arrays)
     except (RuntimeError, MemoryError) as error:
-        # Arrays are as they have to be: what fails is memory.
+        # Arrays are as they have to be: what fails is most likely memory.
         raise RetryError(f"{path}: cannot be encoded: {error}; give a smaller --jobs") from None
 
 

@@ -7,7 +7,7 @@ import OpenEXR
 
 
 def set_zip_level(level: int) -> None:
-    """How hard ZIP searches, for all threads; -1 for OpenEXR's own choice.
+    """How hard ZIP searches, for all threads.
 
     A build that hides this writes the same pixels, in more time.
     """

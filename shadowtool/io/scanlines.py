@@ -168,7 +168,7 @@ def encode(one_pixel: bytes, channels: Mapping[str, NDArray[Any]], level: int) -
 
     Args:
         one_pixel: a file with the wanted header, but whose data window ends where it starts.
-        channels: by name, (H, W), of the types that the header says.
+        channels: by name, (H, W) all of them, of the types that the header says.
         level: how hard ZIP searches.
 
     Returns:
@@ -188,7 +188,7 @@ def encode(one_pixel: bytes, channels: Mapping[str, NDArray[Any]], level: int) -
     except (struct.error, ValueError, LookupError):
         return None
     size = layout.rows * layout.length
-    if not layout.packed or size >= 1 << 31:
+    if not layout.packed or size >= 1 << 31 or layout.channels.keys() != channels.keys():
         return None
     count = -(-height // layout.rows)
     table = np.empty(count, np.uint64)

@@ -94,8 +94,8 @@ class Footage:
         """(H, W) as of `luminance_halfs`, where the camera saw it, and the file's fingerprint.
 
         Args:
-            look: is shown linear light, the same, on the way: some rows' R, G and B, (N, W) each;
-                some rows perhaps again.
+            look: is shown the frame's linear light as it is read, before it is moved: some rows'
+                R, G and B, (N, W) each; some rows perhaps again.
 
         Raises:
             InputError, DamagedFileError: as `image`.
@@ -109,7 +109,9 @@ class Footage:
             made: Float16,
         ) -> None:
             luminance_halfs(red, green, blue, made)
-            if look is not None:
+            # Of another size it is refused below.
+            fits = rows.stop <= self.header.height and red.shape[1] == self.header.width
+            if look is not None and fits:
                 look(rows, red, green, blue)
 
         path = self.sequence.path(frame)

@@ -48,7 +48,7 @@ from shadowtool.core.trembling import UNSTEADY, strips, tremble
 from shadowtool.core.warp_map import Pass
 from shadowtool.errors import DamagedFileError, InputError, MissingError, NoLinesError, ReshootError
 from shadowtool.io.files import fingerprint_file, make_folder
-from shadowtool.io.image import write_png
+from shadowtool.io.image import Header, write_png
 from shadowtool.io.products import LINES, MANIFEST, SCAN, encode_times, write_scan
 from shadowtool.io.sequence import Frame, frame_range
 from shadowtool.parallel import meanwhile, ordered_map
@@ -251,8 +251,35 @@ class _Seen(NamedTuple):
     mark: str
 
 
+class _Colours:
+    """What is kept of a frame's colours while its rows go by.
+
+    Attributes:
+        grid: (h, w, 3) float32, linear light at every so many rows and columns.
+        picture: all of it, to be looked at; None if that is not wanted.
+    """
+
+    def __init__(self, header: Header, every: int, picture: bool) -> None:
+        height, width = header.height, header.width
+        self._every = every
+        self.grid = np.empty((-(-height // every), -(-width // every), 3), np.float32)
+        self.picture = np.empty((height, width, 3), np.uint8) if picture else None
+
+    def add(self, rows: slice, *colours: NDArray[np.floating]) -> None:
+        """Take in some rows' R, G and B."""
+        every = self._every
+        kept = slice(-(-rows.start // every), -(-rows.stop // every))
+        for index, colour in enumerate(colours):
+            self.grid[kept, :, index] = colour[-rows.start % every :: every, ::every]
+            if self.picture is not None:
+                self.picture[rows, :, index] = display(colour)
+
+
 def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _Reading:
     samples = sample_positions(len(frames))
+    # To be moved, a picture has to be whole.
+    steady = footage.vantage is None
+    every = thinning(footage.header.height, footage.header.width) if steady else 1
 
     def read(position: int) -> _Seen | None:
         try:
@@ -264,28 +291,18 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
             raise
 
     def seen(position: int) -> _Seen:
-        sampled, height, width = position in samples.values(), *footage.header.size[::-1]
-        # To be moved, a picture has to be whole.
-        every = 1 if footage.vantage is not None else thinning(height, width)
-        thinned = np.empty((-(-height // every), -(-width // every), 3), np.float32)
-        picture = np.empty((height, width, 3), np.uint8) if position == 0 else None
-
-        def look(rows: slice, *colours: NDArray[np.floating]) -> None:
-            kept = slice(-(-rows.start // every), -(-rows.stop // every))
-            for index, colour in enumerate(colours):
-                thinned[kept, :, index] = colour[-rows.start % every :: every, ::every]
-                if picture is not None:
-                    picture[rows, :, index] = display(colour)
-
-        looked_at = sampled or picture is not None
-        gray, mark = footage.luminance(frames[position], look if looked_at else None)
+        sampled, first = position in samples.values(), position == 0
+        kept = _Colours(footage.header, every, first) if sampled or first else None
+        look = None if kept is None else kept.add
+        gray, mark = footage.luminance(frames[position], look)
         place = footage.off(gray)
         gray = displaced(gray, place)
-        sample = None
-        if sampled:
-            if every == 1:
-                thinned = thin(displaced(thinned, place))
-            sample = thinned, strips(gray)
+        sample = picture = None
+        if kept is not None:
+            picture = kept.picture
+            if sampled:
+                grid = thin(displaced(kept.grid, place)) if every == 1 else kept.grid
+                sample = grid, strips(gray)
         return _Seen(gray, sampled_areas(gray), sample, picture, mark)
 
     finder, exposure = CrossingFinder(), RunningGain()
@@ -499,7 +516,7 @@ def _figures(
     reached = np.isfinite(times.time)
     known = times.time[reached]
     beyond = (known < lines.frame[0]) | (known > lines.frame[-1])
-    # The median of some is that of all.
+    # What is usual, some of them tell.
     errors = times.error[some_of(reached)]
     y, x = some_of(region & reached)
     pace = line_pace(lines, times.time[y, x], np.stack([x, y], axis=-1))

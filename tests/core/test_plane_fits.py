@@ -282,19 +282,42 @@ def test_compiled_or_not_the_same_bits_are_fitted(
         {"size": 0},
         {"radius": 0},
         {"height": -1},
+        {"height": 2**63 - 1},
+        {"radius": 2**62},
+        {"first": 2**62},
+        {"first": -1},
     ],
 )
 def test_what_does_not_fit_together_is_not_chosen_from(wrong: dict) -> None:
-    given = {"planes": 9, "cells": 3, "width": 7, "kind": "f4", "size": 2, "radius": 4, "height": 6}
+    given = {"planes": 9, "cells": 3, "width": 7, "kind": "f4"}
+    given |= {"size": 2, "radius": 4, "height": 6, "first": 0}
 
-    def choose(planes, cells, width, kind, size, radius, height):
+    def choose(planes, cells, width, kind, size, radius, height, first):
         parts = tuple(np.zeros((cells, 7), np.float32) for _ in range(planes))
         chosen = tuple(np.zeros((5, width), kind) for _ in range(4))
-        plane_fits._compiled.choose(parts, chosen, height, size, radius, 0, 3.0)
+        plane_fits._compiled.choose(parts, chosen, height, size, radius, first, 3.0)
 
     choose(**given)
     with pytest.raises(ValueError, match=r"fit together|another type"):
         choose(**given | wrong)
+
+
+@compiled
+def test_nothing_is_done_of_pictures_without_pixels() -> None:
+    """However wide they are."""
+    wide = np.empty((0, 1 << 58), np.float32)
+    plane_fits._compiled.trust(wide, wide, np.empty(wide.shape, bool), 1.0, 3)
+    cells, double = np.empty((11, 0, 1 << 49)), np.empty((0, 1 << 50))
+    plane_fits._compiled.add_up(double, double, cells, 2)
+    plane_fits._compiled.choose((wide,) * 9, (wide,) * 4, 0, 1, 1, 0, 3.0)
+
+
+def test_rows_need_not_lie_one_after_the_other_in_memory() -> None:
+    value, error = measured(3 + 0.1 * ROWS, 0.1)
+    expected = fit_planes(value, error)
+    for order in (np.asfortranarray, lambda a: np.repeat(a, 2, axis=1)[:, ::2], np.float64):
+        for one, other in zip(fit_planes(order(value), order(error)), expected, strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 @compiled

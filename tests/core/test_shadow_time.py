@@ -96,6 +96,8 @@ def test_times_are_the_same_bits_compiled_or_not(height, width, noise, trembling
     at = rng.integers(0, 60, shape).astype(np.int32)
     # A crossing is from light to dark.
     at[~(np.isfinite(lit + dark) & (before > after))] = 0
+    # More light than a half can hold.
+    lit[rng.random(shape) < 0.01] = np.inf
     crossings = Crossings(at, before, after, dark, lit, at < 0, 60)
     found = own_times(crossings, NOISE, trembling)
     with pytest.MonkeyPatch.context() as patch:
@@ -103,6 +105,15 @@ def test_times_are_the_same_bits_compiled_or_not(height, width, noise, trembling
         expected = own_times(crossings, NOISE, trembling)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_crossings_need_not_lie_one_after_the_other_in_memory():
+    found = crossings_of(sweep_frames(Sweep(0.5, soft=8.0), 0.003))
+    expected = own_times(found, NOISE)
+    other = Crossings(*(np.asfortranarray(part) for part in found[:-1]), found.frames)
+    other = other._replace(at=found.at.astype(np.int64))
+    for one, two in zip(own_times(other, NOISE), expected, strict=True):
+        np.testing.assert_array_equal(one, two)
 
 
 @compiled

@@ -207,6 +207,25 @@ def test_a_quick_file_holds_the_same(tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "quick.exr").layers["RGB"], values)
 
 
+@pytest.mark.parametrize(
+    "channels",
+    [
+        {"A": (6, 7), "B": (6, 5)},
+        {"A": (6, 7), "B": (1, 7)},
+        {"A": (6, 7), "B": (6, 1)},
+        {"RGB": (6, 7, 4)},
+        {"RGBA": (6, 7, 3)},
+        {"Y": (6, 7, 3)},
+        {"Y": (6,)},
+    ],
+)
+def test_channels_of_other_shapes_are_not_written(channels, tmp_path):
+    arrays = {name: np.ones(shape, np.float16) for name, shape in channels.items()}
+    with pytest.raises((TypeError, ValueError)):
+        write_exr(tmp_path / "a.exr", arrays)
+    assert not list(tmp_path.iterdir())
+
+
 def test_quick_and_other_writers_do_not_mix(tmp_path):
     values = np.tile(random(100, 40, 3), (1, 4, 1)).astype(np.float16)
 

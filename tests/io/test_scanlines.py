@@ -389,6 +389,24 @@ def test_chunks_for_which_there_is_no_room_are_not_deflated(room):
     assert (memory[room:] == 7).all()
 
 
+def test_chunks_for_whose_places_there_is_no_room_are_not_deflated():
+    deflate = deflating()
+    assert deflate is not None
+    rows, target = np.zeros(20, np.uint8), np.zeros(900, np.uint8)
+    for count, done in ((0, False), (4, False), (5, True), (6, True)):
+        places = np.zeros(count, np.uint64)
+        assert (_zip.zip(deflate, 4, rows, target, 0, places, 0, 1, 4) > 0) == done
+
+
+def test_chunks_of_more_bytes_than_there_are_are_an_error():
+    deflate, target = deflating(), np.zeros(8, np.uint8)
+    assert deflate is not None
+    with pytest.raises(ValueError, match="more bytes than there are"):
+        _zip.zip(deflate, 4, target, target, 0, target, 0, 1 << 40, 1 << 40)
+    with pytest.raises(ValueError, match="more bytes than there are"):
+        _zip.unzip(0, b"", table(), target, 0, 1 << 40, 1 << 40)
+
+
 @pytest.mark.parametrize("place", [-1, 9, 1 << 62])
 def test_a_place_outside_the_target_is_an_error(place):
     deflate = deflating()

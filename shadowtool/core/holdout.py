@@ -95,7 +95,8 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     stack = np.stack([channels(sample) for sample in samples])
     stack = np.nan_to_num(stack, copy=False, nan=0.0, posinf=1e4, neginf=0.0)
     weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
-    ascending = np.argsort(stack.sum(axis=1), axis=0)
+    # Of equals the first, on any processor.
+    ascending = np.argsort(stack.sum(axis=1), axis=0, kind="stable")
     bright = usually_bright(stack, ascending)
     common = common_ratio(stack, bright, ascending, noise, shape[:2])
     ratio = np.full(stack.shape[1:], _ANY_RATIO, np.float32) if common is None else common

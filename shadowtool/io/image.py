@@ -92,7 +92,7 @@ class Image:
         header: see `Header`.
         layers: arrays by name, (H, W) or (H, W, C), of the display window's size; float16 or
             float32, PNG's 8 and 16 bit as uint8 and uint16. Colour stands under "RGB" or "RGBA",
-            or in channels "R", "G" and "B" of their own if that was asked for.
+            or in channels "R", "G" and "B" of their own for `read_made`.
         fingerprint: of the file's content.
     """
 

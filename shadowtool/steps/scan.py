@@ -195,7 +195,7 @@ def scan(
             return time_picture(picture, times.time, lines, region)
 
         make_folder(output)
-        with meanwhile(lambda: write_png(output / PICTURE, draw(), provenance)) as drawn:
+        with meanwhile(lambda: write_png(output / PICTURE, draw(), provenance, True)) as drawn:
             bend = line_bend(points, numbers, lines, footage.header.size)
             figures = _figures(times, lines, region, gains, bend) | {
                 "skipped": frame_range(skipped),

@@ -750,6 +750,18 @@ def test_types_that_png_does_not_hold_are_refused(dtype, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_grainy_png_is_the_same_picture_in_hardly_more_room(dtype, tmp_path):
+    values = np.random.default_rng(1).normal(90, 5, (60, 80, 3)).astype(dtype)
+    for grainy in (False, True):
+        write_png(tmp_path / f"{grainy}.png", values, {"command": "a"}, grainy)
+        image = read_image(tmp_path / f"{grainy}.png")
+        np.testing.assert_array_equal(image.layers["RGB"], values)
+        assert image.header.provenance == {"command": "a"}
+    plain, grainy = ((tmp_path / f"{name}.png").stat().st_size for name in (False, True))
+    assert grainy < 1.05 * plain
+
+
 def test_png_provenance_comes_back(tmp_path):
     texts = {"version": "0.1", "command": "shadowtool matte größe", "figures": '{"a": 1}'}
     write_png(tmp_path / "a.png", np.zeros((2, 2), np.uint8), texts)

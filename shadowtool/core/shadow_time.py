@@ -198,8 +198,9 @@ def own_times(
         for values, enough in zip((lost[rows], left[rows]), least, strict=True):
             values *= values > enough
             total += values * (1 - values)
-    duration = 6 * _local_mean(passing, known)
-    longer = 1 / np.maximum(_local_mean(fall, known), np.float32(1 / _LONGEST))
+    duration, slower = _local_means([passing, fall], known)
+    duration *= np.float32(6)
+    longer = 1 / np.maximum(slower, np.float32(1 / _LONGEST))
     # Two frames tell of no more than three.
     np.copyto(duration, longer, where=(longer > _LONG) & (duration > 1))
     time, error = _told(crossings, noise, rough, (lost, left, duration))
@@ -495,8 +496,8 @@ def _largest(count: float) -> float:
     return float(reach - (np.log(np.log(max(count, 3))) + np.log(4 * np.pi)) / (2 * reach))
 
 
-def _local_mean(values: Float32, known: Bool) -> Float32:
-    """Mean over the known pixels around each; the others are 0."""
+def _local_means(pictures: list[Float32], known: Bool) -> list[Float32]:
+    """Means over the known pixels around each; the others are 0."""
     size = (2 * _LOCAL + 1, 2 * _LOCAL + 1)
 
     def total(image: NDArray[Any]) -> NDArray[Any]:
@@ -504,6 +505,6 @@ def _local_mean(values: Float32, known: Bool) -> Float32:
             image, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT
         )
 
-    mean, count = total(values), total(known.view(np.uint8))
-    mean /= np.maximum(count, 1, out=count)
-    return np.asarray(mean, np.float32)
+    count = total(known.view(np.uint8))
+    np.maximum(count, 1, out=count)
+    return [np.asarray(total(picture) / count, np.float32) for picture in pictures]

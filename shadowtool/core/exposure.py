@@ -285,7 +285,7 @@ class RunningGain:
         agreed = np.count_nonzero(np.abs(changes - middle) < _NEAR[0])
         if agreed < max(_LEAST_PART * gray.size, _LEAST_PIXELS):
             return self._gain()
-        spread = 1.48 * float(np.median(np.abs(changes - middle)))
+        spread = 1.48 * float(median(np.abs(changes - middle)))
         expected = self._logarithm + _closed_in(changes, middle, spread)
         ratios = _ratios(gray, self._first)
         same = np.abs(ratios - expected) < max(_NEAR[0], spread)

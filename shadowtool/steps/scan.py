@@ -14,6 +14,7 @@ from shadowtool.core.camera_motion import displaced
 from shadowtool.core.crossings import CrossingFinder, Crossings, SecondLook
 from shadowtool.core.exposure import RunningGain, sampled_areas, without_gain
 from shadowtool.core.lengths import length
+from shadowtool.core.medians import median
 from shadowtool.core.noise import (
     NoiseModel,
     noise_levels,
@@ -538,11 +539,11 @@ def _figures(
         },
         "predicted_error": {
             # Of a time, in frames, and on the plane as far as the edge moves meanwhile.
-            "frames": round(float(np.median(errors)), 4),
-            "pixels": round(float(np.median(times.error[y, x] * pace)), 3),
+            "frames": round(float(median(errors)), 4),
+            "pixels": round(float(median(times.error[y, x] * pace)), 3),
         },
         "bend": {"pixels": round(bend.pixels, 2), "certainty": round(min(bend.certainty, 1e6), 1)},
-        "pixels_per_frame": round(float(np.median(pace)), 3),
+        "pixels_per_frame": round(float(median(pace)), 3),
         "direction_degrees": round(math.degrees(float(lines.angle[len(lines) // 2])) % 360, 2),
         "turned_degrees": round(turned, 2),
     }

@@ -584,10 +584,14 @@ def test_colour_channels_of_different_types_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("types", ["eff", "eee", "fff", "III"])
+@pytest.mark.parametrize("alpha", [False, True])
 @pytest.mark.parametrize("transfer", ["auto", "srgb"])
-def test_colours_are_those_of_rgb(types, transfer, tmp_path):
+def test_colours_are_those_of_rgb(types, alpha, transfer, tmp_path):
     channels = {n: (9 * random(4, 5)).astype(t) for n, t in zip("RGB", types, strict=True)}
-    image = read_image(raw_exr(tmp_path / "a.exr", channels))
+    if alpha:
+        channels["A"] = random(4, 5, dtype=np.float16)
+    window = {"dataWindow": box(2, 1, 5, 4), "displayWindow": box(0, 0, 6, 7)}
+    image = read_image(raw_exr(tmp_path / "a.exr", channels, **window))
     np.testing.assert_array_equal(np.stack(image.colours(transfer), axis=-1), image.rgb(transfer))
 
 

@@ -1,4 +1,4 @@
-/* What `_trusted`, `_moments` and `_choose` of plane_fits.py do, row after row. */
+/* What `_trusted`, `_moments`, `_solve` and `_choose` of plane_fits.py do, row after row. */
 
 #include "_arrays.h"
 #include <math.h>
@@ -142,8 +142,68 @@ static inline void add_up(const cells_t *cells, int size, double *room)
     }
 }
 
-/* The parts of `_Planes`, and of `_Choice`. */
-enum { A, B, C, AA, AB, AC, BB, BC, CC, PLANES };
+/* The parts of `_Planes`. */
+enum { A, B, C, R, P, PX, PY, Q, QY, PLANES };
+
+/* As of `_solve`; the rest are its constants, and the weight besides that of measurements. */
+typedef struct {
+    double factor, radius, weight, level, floor, misfit;
+} terms_t;
+
+static inline double most(double one, double other)
+{
+    return one > other ? one : other;
+}
+
+/* So many pixels' planes are worked out together, side by side. */
+enum { TOGETHER = 256 };
+
+/* The planes of so many pixels, from the sums over their windows that begin there. */
+static inline void solve_some(const double *const *sums, float (*planes)[TOGETHER],
+                              Py_ssize_t first_pixel, Py_ssize_t count, terms_t terms)
+{
+    const double *part[MOMENTS];
+    for (int index = 0; index < MOMENTS; index++)
+        part[index] = sums[index] + first_pixel;
+    for (Py_ssize_t at = 0; at < count; at++) {
+        double wx = part[1][at], wy = part[2][at], wv = part[6][at], used = part[10][at];
+        /* About the weighted mean. */
+        double inverse = 1 / (part[0][at] + terms.weight);
+        double x = wx * inverse, y = wy * inverse, v = wv * inverse;
+        double wxx = part[3][at] + terms.level - wx * x, wxy = part[4][at] - wx * y;
+        double wyy = part[5][at] + terms.level - wy * y;
+        double wvx = part[7][at] - x * wv, wvy = part[8][at] - y * wv, wvv = part[9][at] - v * wv;
+        double second = 1 / most(wyy, terms.level), slant = wxy * second;
+        double first = 1 / most(wxx - slant * wxy, terms.level);
+        double b = first * (wvx - slant * wvy), c = second * wvy - slant * b;
+        double misfit = (wvv - (b * wvx + c * wvy)) / most(used - 3, 1);
+        double worse = most(misfit, 1) * terms.factor;
+        double p = sqrt(first * worse), q = sqrt(second * worse), px = p * terms.radius;
+        float alone = (float)(inverse * worse + terms.floor);
+        planes[A][at] = (float)(v - (b * x + c * y));
+        planes[B][at] = (float)(b * terms.radius);
+        planes[C][at] = (float)(c * terms.radius);
+        planes[R][at] = (misfit >= terms.misfit) | (used < 4) ? INFINITY : alone;
+        planes[P][at] = (float)(p * (slant * y - x));
+        planes[PX][at] = (float)px;
+        planes[PY][at] = (float)-(slant * px);
+        planes[Q][at] = (float)-(q * y);
+        planes[QY][at] = (float)(q * terms.radius);
+    }
+}
+
+static void solve(const double *const *sums, float *const *planes, Py_ssize_t count, terms_t terms)
+{
+    float some[PLANES][TOGETHER];
+    for (Py_ssize_t at = 0; at < count; at += TOGETHER) {
+        Py_ssize_t left = count - at < TOGETHER ? count - at : TOGETHER;
+        solve_some(sums, some, at, left, terms);
+        for (int part = 0; part < PLANES; part++)
+            memcpy(planes[part] + at, some[part], (size_t)left * sizeof **some);
+    }
+}
+
+/* The parts of a choice: those of `_Planes`, and then those of `_Choice`. */
 enum { VALUE = PLANES, VARIANCE, LEAST, MOST, ALL };
 
 typedef struct {
@@ -157,34 +217,36 @@ typedef struct {
     float agrees;
 } choice_t;
 
-/* Planes at one y, and between what the value has to lie. */
+/* Planes at one y, and between what the value has to lie. The variance at x is rest +
+ * (lean + x PX)². */
 typedef struct {
-    float *value, *variance, *slope, *least, *most;
+    float *value, *rest, *lean, *least, *most;
 } lines_t;
 
 /* Take the lines, at 0 or one radius to the left or right, where they are known better. */
-static inline void take(const float *restrict value, const float *restrict slope,
-                        const float *restrict variance, const float *restrict mixed,
-                        const float *restrict square, int side, const lines_t *lines,
-                        float *restrict best, float *restrict spread, Py_ssize_t start,
-                        Py_ssize_t count)
+static inline void take(const choice_t *choice, const lines_t *lines, Py_ssize_t cell, int side,
+                        Py_ssize_t from, float *restrict best, float *restrict spread,
+                        Py_ssize_t start, Py_ssize_t count)
 {
+    const float *restrict value = lines->value + from, *restrict lean = lines->lean + from;
+    const float *restrict rest = lines->rest + from;
+    const float *restrict slope = choice->parts[B] + cell + from;
+    const float *restrict growth = choice->parts[PX] + cell + from;
     const float *restrict least = lines->least + start, *restrict most = lines->most + start;
     for (Py_ssize_t at = 0; at < count; at++) {
-        float own = value[at], of_own = variance[at];
+        float own = value[at], leant = lean[at];
         if (side > 0) {
             own += slope[at];
-            of_own += mixed[at];
-            of_own += square[at];
+            leant += growth[at];
         } else if (side < 0) {
             own -= slope[at];
-            of_own -= mixed[at];
-            of_own += square[at];
+            leant -= growth[at];
         }
-        float before = best[at], of_before = spread[at];
+        float of_own = rest[at] + leant * leant;
+        float before = best[start + at], of_before = spread[start + at];
         int better = (of_own < of_before) & (own >= least[at]) & (own <= most[at]);
-        best[at] = better ? own : before;
-        spread[at] = better ? of_own : of_before;
+        best[start + at] = better ? own : before;
+        spread[start + at] = better ? of_own : of_before;
     }
 }
 
@@ -212,25 +274,22 @@ static void choose_row(const choice_t *choice, const lines_t *lines, Py_ssize_t 
         for (int index = 0; index < PLANES; index++)
             part[index] = choice->parts[index] + cell;
         for (Py_ssize_t at = 0; at < width; at++) {
+            float alone = part[Q][at] + y * part[QY][at];
             lines->value[at] = part[A][at] + y * part[C][at];
-            lines->variance[at] = part[AA][at] + y * (part[AC][at] + y * part[CC][at]);
-            lines->slope[at] = part[AB][at] + y * part[BC][at];
+            lines->rest[at] = part[R][at] + alone * alone;
+            lines->lean[at] = part[P][at] + y * part[PY][at];
         }
         for (int dx = -1; dx <= 1; dx++) {
             Py_ssize_t ahead = dx * radius, start = ahead < 0 ? -ahead : 0;
             Py_ssize_t count = width - (ahead < 0 ? -ahead : ahead), from = start + ahead;
             if (count <= 0)
                 continue;
-            const float *value = lines->value + from, *variance = lines->variance + from;
-            const float *slope = part[B] + from, *mixed = lines->slope + from;
-            const float *square = part[BB] + from;
-            float *own = best + start, *of_own = spread + start;
             if (dx < 0)
-                take(value, slope, variance, mixed, square, 1, lines, own, of_own, start, count);
+                take(choice, lines, cell, 1, from, best, spread, start, count);
             else if (dx > 0)
-                take(value, slope, variance, mixed, square, -1, lines, own, of_own, start, count);
+                take(choice, lines, cell, -1, from, best, spread, start, count);
             else
-                take(value, slope, variance, mixed, square, 0, lines, own, of_own, start, count);
+                take(choice, lines, cell, 0, from, best, spread, start, count);
         }
     }
 }
@@ -303,6 +362,41 @@ static PyObject *py_add_up(PyObject *module, PyObject *arguments)
     return let_go(&held);
 }
 
+static PyObject *py_solve(PyObject *module, PyObject *arguments)
+{
+    PyObject *given, *planes;
+    held_t held = {0};
+    terms_t terms;
+    const double *sums[MOMENTS];
+    float *parts[PLANES];
+    int fit;
+    (void)module;
+    if (!PyArg_ParseTuple(arguments, "O!O!dddddd", &PyTuple_Type, &given, &PyTuple_Type, &planes,
+                          &terms.factor, &terms.radius, &terms.weight, &terms.level, &terms.floor,
+                          &terms.misfit))
+        return NULL;
+    fit = PyTuple_Size(given) == MOMENTS && PyTuple_Size(planes) == PLANES;
+    for (int part = 0; fit && part < MOMENTS; part++) {
+        const Py_buffer *own = hold(&held, PyTuple_GetItem(given, part), 8, PyBUF_C_CONTIGUOUS);
+        fit = own && alike(own, held.views);
+        sums[part] = own ? own->buf : NULL;
+    }
+    for (int part = 0; fit && part < PLANES; part++) {
+        const Py_buffer *own = hold(&held, PyTuple_GetItem(planes, part), 4,
+                                    PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE);
+        fit = own && alike(own, held.views);
+        parts[part] = own ? own->buf : NULL;
+    }
+    if (fit) {
+        Py_BEGIN_ALLOW_THREADS
+        solve(sums, parts, held.views->len / 8, terms);
+        Py_END_ALLOW_THREADS
+    } else if (!PyErr_Occurred()) {
+        PyErr_SetString(PyExc_ValueError, "sums and planes that don't fit together");
+    }
+    return let_go(&held);
+}
+
 static PyObject *py_choose(PyObject *module, PyObject *arguments)
 {
     PyObject *planes, *chosen;
@@ -357,6 +451,10 @@ static PyMethodDef methods[] = {
      "trust(value, allowed, trusted, near, least)\n\n"
      "Which measurements agree with at least so many of the eight around them: value and allowed,\n"
      "(H, W) single floats; trusted, (H, W) bool, is written to."},
+    {"solve", py_solve, METH_VARARGS,
+     "solve(sums, planes, factor, radius, weight, level, floor, misfit)\n\n"
+     "The planes of sums over windows: eleven arrays of one shape, double floats. planes is a\n"
+     "`_Planes` of that shape, single floats, which is written to. factor and floor are squared."},
     {"choose", py_choose, METH_VARARGS,
      "choose(planes, chosen, height, size, radius, first, agrees)\n\n"
      "Replace what was chosen where a plane is known better. planes is a `_Planes`, for so many\n"

@@ -44,8 +44,8 @@ _USUAL_MISFIT, _TOLD = 1.2, 200_000
 _AGREES = 3.0
 # Of the eight pixels around a measurement so many have to agree with it.
 _COMPANY = 3
-# Slopes are held back as if each window had seen none, with this weight.
-_LEVEL = 0.1
+# Slopes are held back as if each window had seen none, with this weight; and values by this.
+_LEVEL, _WEIGHT = 0.1, 1e-9
 # No plane is known better than this.
 _FLOOR = 0.02
 # Nor does a measurement weigh more than as of this variance: digits would not do for it and others.
@@ -240,8 +240,10 @@ def _cells(radius: int) -> tuple[int, int]:
 
 class _Planes(NamedTuple):
     """The planes a + bx + cy fitted to the windows around cells, x and y counted in radii; the
-    variance at (x, y) is aa + x·ab + y·ac + x²·bb + xy·bc + y²·cc, infinite where the window holds
-    more than one surface. (rows of cells, W) float32 each.
+    variance at (x, y) is r + (p + x·px + y·py)² + (q + y·qy)², infinite where the window holds more
+    than one surface. (rows of cells, W) float32 each.
+
+    Squares, as of a sum of products rounding may leave less than nothing.
 
     They stand for each column of pixels, x counted from it, and y from the middle of the cells.
     """
@@ -249,43 +251,42 @@ class _Planes(NamedTuple):
     a: Float32
     b: Float32
     c: Float32
-    aa: Float32
-    ab: Float32
-    ac: Float32
-    bb: Float32
-    bc: Float32
-    cc: Float32
+    r: Float32
+    p: Float32
+    px: Float32
+    py: Float32
+    q: Float32
+    qy: Float32
 
     def from_column(self, x: Float32) -> "_Planes":
         """The same counted from (x, 0)."""
-        a, b, c, aa, ab, ac, bb, bc, cc = self
-        a, aa = a + x * b, aa + x * (ab + x * bb)
-        return _Planes(a, b, c, aa, ab + 2 * x * bb, ac + x * bc, bb, bc, cc)
+        return self._replace(a=self.a + x * self.b, p=self.p + x * self.px)
 
     def along(self, rows: slice, y: Float32) -> "_Lines":
         """What they are at several y, (N, 1), for some rows."""
-        a, b, c, aa, ab, ac, bb, bc, cc = (part[rows, np.newaxis] for part in self)
-        return _Lines(a + y * c, b, aa + y * (ac + y * cc), ab + y * bc, bb)
+        a, b, c, r, p, px, py, q, qy = (part[rows, np.newaxis] for part in self)
+        q = q + y * qy
+        return _Lines(a + y * c, b, r + q * q, p + y * py, px)
 
 
 class _Lines(NamedTuple):
-    """Planes at one y each: a + bx, with the variance aa + x·ab + x²·bb; (rows of cells, N, W)."""
+    """Planes at one y each: a + bx, with the variance r + (p + x·px)²; (rows of cells, N, W)."""
 
     a: Float32
     b: Float32
-    aa: Float32
-    ab: Float32
-    bb: Float32
+    r: Float32
+    p: Float32
+    px: Float32
 
     def at(self, x: int, columns: slice) -> tuple[Float32, Float32]:
         """Value and variance at x, which is -1, 0 or 1, of some columns; (rows, columns)."""
-        a, b, aa, ab, bb = (part[..., columns] for part in self)
+        a, b, r, p, px = (part[..., columns] for part in self)
         if x:
             combine = np.add if x > 0 else np.subtract
-            a, aa = combine(a, b), combine(aa, ab)
-            aa += bb
+            a, p = combine(a, b), combine(p, px)
+        variance = r + p * p
         shape = a.shape[0] * a.shape[1], a.shape[2]
-        return a.reshape(shape), aa.reshape(shape)
+        return a.reshape(shape), variance.reshape(shape)
 
 
 class _Fitted(NamedTuple):
@@ -376,7 +377,7 @@ def _planes(value: Float64, weight: Float64, size: int, cells: int, factor: floa
 def _images(value: Float64, weight: Float64) -> list[tuple[Floats, Powers]]:
     """What is summed up over windows, and times which powers (a, b) of the place, xᵃyᵇ."""
     weighted = weight * value
-    used = (weight > 0).astype(np.float32)
+    used = (weight > 0).astype(np.float64)
     return list(zip((weight, weighted, weighted * value, used), _POWERS, strict=True))
 
 
@@ -479,45 +480,40 @@ def _solve(
     rows: slice,
     planes: _Planes,
 ) -> None:
-    """The planes of some rows from the sums over their windows, which are overwritten."""
+    """The planes of some rows from the sums over their windows."""
+    terms = (factor**2, radius, _WEIGHT, _LEVEL, _FLOOR**2, _MISFIT)
+    if _compiled is not None:
+        _compiled.solve(tuple(sums), tuple(part[rows] for part in planes), *terms)
+        return
     w, wx, wy, wxx, wxy, wyy, wv, wvx, wvy, wvv, count = sums
-    w += 1e-9
-    wxx += _LEVEL
-    wyy += _LEVEL
     # About the weighted mean, where slopes and level are told apart.
-    inverse = 1 / w
+    inverse = 1 / (w + _WEIGHT)
     mean_x, mean_y, mean_v = wx * inverse, wy * inverse, wv * inverse
-    wxx -= wx * mean_x
-    wxy -= wx * mean_y
-    wyy -= wy * mean_y
-    wvx -= mean_x * wv
-    wvy -= mean_y * wv
-    wvv -= mean_v * wv
-    determinant = wxx * wyy - wxy * wxy
-    slopes = wyy / determinant, -wxy / determinant, wxx / determinant
-    # From here on nothing large cancels out.
-    x, y, caa, cbb, cbc, ccc, vx, vy, misfit = (
-        part.astype(np.float32) for part in (mean_x, mean_y, inverse, *slopes, wvx, wvy, wvv)
-    )
-    b = cbb * vx + cbc * vy
-    c = cbc * vx + ccc * vy
-    planes.a[rows] = mean_v
-    planes.a[rows] -= b * x + c * y
-    np.multiply(b, radius, out=planes.b[rows])
-    np.multiply(c, radius, out=planes.c[rows])
-    misfit -= b * vx + c * vy
-    misfit /= np.maximum(count - 3, 1)
-    cab, cac = cbb * x + cbc * y, cbc * x + ccc * y
-    caa += cab * x + cac * y
-    worse = np.maximum(misfit, 1)
-    worse *= factor**2
-    elements: tuple[Float32, ...] = (caa, cab, cac, cbb, cbc, ccc)
-    factors = (1, -2 * radius, -2 * radius, radius**2, 2 * radius**2, radius**2)
-    for part, element, times in zip(planes[3:], elements, factors, strict=True):
-        np.multiply(element, worse, out=part[rows])
-        part[rows] *= times
-    planes.aa[rows] += np.float32(_FLOOR**2)
-    planes.aa[rows][(misfit >= _MISFIT) | (count < 4)] = np.inf
+    wxx = wxx + _LEVEL - wx * mean_x
+    wxy = wxy - wx * mean_y
+    wyy = wyy + _LEVEL - wy * mean_y
+    wvx, wvy, wvv = wvx - mean_x * wv, wvy - mean_y * wv, wvv - mean_v * wv
+    # The slopes' covariance, as the squares of what they have in common and of the second alone.
+    # But for rounding neither is known worse than from what holds them back.
+    second = 1 / np.maximum(wyy, _LEVEL)
+    slant = wxy * second
+    first = 1 / np.maximum(wxx - slant * wxy, _LEVEL)
+    b = first * (wvx - slant * wvy)
+    c = second * wvy - slant * b
+    misfit = (wvv - (b * wvx + c * wvy)) / np.maximum(count - 3, 1)
+    worse = np.maximum(misfit, 1) * factor**2
+    p, q = np.sqrt(first * worse), np.sqrt(second * worse)
+    px = p * radius
+    planes.a[rows] = mean_v - (b * mean_x + c * mean_y)
+    planes.b[rows] = b * radius
+    planes.c[rows] = c * radius
+    planes.r[rows] = inverse * worse + _FLOOR**2
+    planes.r[rows][(misfit >= _MISFIT) | (count < 4)] = np.inf
+    planes.p[rows] = p * (slant * mean_y - mean_x)
+    planes.px[rows] = px
+    planes.py[rows] = -(slant * px)
+    planes.q[rows] = -(q * mean_y)
+    planes.qy[rows] = q * radius
 
 
 def _overlap(

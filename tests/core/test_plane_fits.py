@@ -1,3 +1,4 @@
+from fractions import Fraction
 from itertools import product
 
 import numpy as np
@@ -272,6 +273,21 @@ def test_compiled_or_not_the_same_bits_are_fitted(
 
 
 @compiled
+@pytest.mark.parametrize("wrong", [{"sums": 10}, {"planes": 8}, {"kind": "f8"}, {"width": 6}])
+def test_sums_that_do_not_fit_together_are_not_solved(wrong: dict) -> None:
+    def solve(sums: int = 11, planes: int = 9, kind: str = "f4", width: int = 7) -> None:
+        plane_fits._compiled.solve(
+            tuple(np.ones((5, 7)) for _ in range(sums)),
+            tuple(np.empty((5, width), kind) for _ in range(planes)),
+            *(1.0, 2, 1e-9, 0.1, 4e-4, 1.5),
+        )
+
+    solve()
+    with pytest.raises(ValueError, match=r"fit together|another type"):
+        solve(**wrong)
+
+
+@compiled
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -390,11 +406,8 @@ def test_errors_that_are_understated_keep_no_plane_from_being_fitted() -> None:
     assert off_raised < 0.5 * off
 
 
-@pytest.mark.parametrize(("radius", "unknown", "seed"), [(28, 0.9, 19), (24, 0.3, 868)])
-def test_where_few_errors_of_nothing_lead_predictions_are_numbers(
-    radius: int, unknown: float, seed: int
-) -> None:
-    """Variances whose large terms cancel out; rounding leaves less than nothing of some."""
+def of_few_errors(seed: int, unknown: float) -> tuple[np.ndarray, np.ndarray]:
+    """Two planes, half of whose measurements have errors of nothing; and their errors."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:60, :78]
     value = rng.normal() * x + rng.normal() * y + rng.normal() * 50
@@ -404,6 +417,83 @@ def test_where_few_errors_of_nothing_lead_predictions_are_numbers(
     error[rng.random(x.shape) < 0.5] = 0
     value = (value + error * rng.normal(size=x.shape)).astype(np.float32)
     value[rng.random(x.shape) < unknown] = np.nan
-    fitted, spread = fit_planes(value, error.astype(np.float32), Windows((radius,), near=3.0))
+    return value, error.astype(np.float32)
+
+
+@pytest.mark.parametrize(("radius", "unknown", "seed"), [(28, 0.9, 19), (24, 0.3, 868)])
+def test_where_few_errors_of_nothing_lead_predictions_are_numbers(
+    radius: int, unknown: float, seed: int
+) -> None:
+    """Variances whose large terms cancel out; rounding leaves less than nothing of some."""
+    value, error = of_few_errors(seed, unknown)
+    fitted, spread = fit_planes(value, error, Windows((radius,), near=3.0))
     known = np.isfinite(value)
     assert np.isfinite(fitted[known]).all() and (spread[known] >= 0).all()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("columns", "factor"), [(2, 4.8), (3, 2.7), (4, 7.2), (9, 1.6), (31, 5.5), (78, 6.7)]
+)
+@pytest.mark.parametrize("seed", range(4))
+def test_no_plane_is_known_better_than_any_can_be(columns: int, factor: float, seed: int) -> None:
+    """Wide windows on narrow strips, whose slopes are hardly known."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:60, :78]
+    error = rng.choice([0.03, 0.1, 2.0, 20.0], x.shape, p=rng.dirichlet([0.2] * 4))
+    value = (rng.normal() * x + rng.normal() * y + error * rng.normal(size=x.shape)).astype("f4")
+    value[:, columns:] = np.nan
+    fitted, spread = fit_planes(value, error.astype(np.float32), Windows.for_step(8 * factor))
+    assert np.isfinite(fitted[:, :columns]).all()
+    assert (spread >= np.float32(0.02)).all()
+
+
+def exact_plane(parts: list[tuple[float, float, int, int]]) -> tuple[Fraction, Fraction]:
+    """A plane's value at (0, 0), and its misfit, from values, weights and places."""
+    used = [tuple(map(Fraction, part)) for part in parts]
+    sums = {
+        (power, a, b): sum(weight * value**power * x**a * y**b for value, weight, x, y in used)
+        for power, a, b in product(range(3), repeat=3)
+    }
+    w, wx, wy = sums[0, 0, 0] + Fraction(1e-9), sums[0, 1, 0], sums[0, 0, 1]
+    wxx, wxy, wyy = sums[0, 2, 0], sums[0, 1, 1], sums[0, 0, 2]
+    wv, wvx, wvy = sums[1, 0, 0], sums[1, 1, 0], sums[1, 0, 1]
+    wxx, wyy = (total + Fraction(0.1) for total in (wxx, wyy))
+    # Cramer's rule.
+    ca, cb, cc = wxx * wyy - wxy**2, wxy * wy - wx * wyy, wx * wxy - wxx * wy
+    determinant = w * ca + wx * cb + wy * cc
+    a = (ca * wv + cb * wvx + cc * wvy) / determinant
+    b = (cb * wv + (w * wyy - wy**2) * wvx + (wx * wy - w * wxy) * wvy) / determinant
+    c = (cc * wv + (wx * wy - w * wxy) * wvx + (w * wxx - wx**2) * wvy) / determinant
+    return a, (sums[2, 0, 0] - a * wv - b * wvx - c * wvy) / max(len(used) - 3, 1)
+
+
+@pytest.mark.parametrize(("radius", "unknown", "seed"), [(28, 0.9, 19), (24, 0.9, 3)])
+def test_planes_of_errors_of_all_sizes_are_those_of_exact_arithmetic(
+    radius: int, unknown: float, seed: int
+) -> None:
+    """As are those windows that hold more than one surface."""
+    value, error = of_few_errors(seed, unknown)
+    known, variance = plane_fits._known(value, error)
+    trusted = plane_fits._trusted(value, known, variance, 3.0)
+    weight = np.where(trusted, 1 / np.maximum(variance.astype(np.float64), 1e-6), 0)
+    size, cells = plane_fits._cells(radius)
+    planes = plane_fits._planes(np.nan_to_num(value, nan=0.0).astype("f8"), weight, size, cells, 1)
+    y, x = np.nonzero(trusted)
+    compared = 0
+    for row, cell in np.ndindex(15, 19):
+        inside = (abs(y // size - row) <= cells) & (abs(x // size - cell) <= cells)
+        if inside.sum() < 4:
+            continue
+        parts = [
+            (float(value[at]), float(weight[at]), at[1] - cell * size, at[0] - row * size - 1.5)
+            for at in zip(y[inside].tolist(), x[inside].tolist(), strict=True)
+        ]
+        a, misfit = exact_plane(parts)
+        one_surface = np.isfinite(planes.planes.r[row, cell * size])
+        if abs(misfit / Fraction(1.5) - 1) > 0.01:
+            assert one_surface == (misfit < 1.5)
+        if one_surface:
+            assert planes.planes.a[row, cell * size] == pytest.approx(float(a), abs=1e-3)
+            compared += 1
+    assert compared > 20

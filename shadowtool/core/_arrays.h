@@ -8,7 +8,7 @@
 
 /* Zero to begin with; no function here holds more. */
 typedef struct {
-    Py_buffer views[20];
+    Py_buffer views[32];
     int count;
 } held_t;
 

@@ -7,8 +7,9 @@
 /* The key of NaN, beyond all others; and one below all others. */
 #define UNKNOWN 0x7E00
 #define LOWEST (-0x8000)
-/* So many pixels are looked at together, which lets the compiler take several at a time. */
-#define TOGETHER 4096
+/* So many pixels are looked at together, which lets the compiler take several at a time; few, as
+ * frames are then fetched side by side. */
+#define TOGETHER 128
 
 /* What is known of each pixel: `_State`. */
 typedef struct {
@@ -136,7 +137,8 @@ static void extremes(const pass_t *pass, Py_ssize_t start, Py_ssize_t count, int
 {
     for (Py_ssize_t row = pass->seen; row < pass->all; row++) {
         const int16_t *frame = pass->frames[row] + start;
-        memcpy(lower, low, 2 * (size_t)count);
+        if (row == pass->all - 1)
+            memcpy(lower, low, 2 * (size_t)count);
         for (Py_ssize_t at = 0; at < count; at++) {
             low[at] = least(low[at], frame[at]);
             high[at] = most(high[at], frame[at] == UNKNOWN ? LOWEST : frame[at]);
@@ -150,6 +152,7 @@ static void settle(const state_t *state, const pass_t *pass, Py_ssize_t pixels)
     for (Py_ssize_t start = 0; start < pixels; start += TOGETHER) {
         Py_ssize_t count = pixels - start < TOGETHER ? pixels - start : TOGETHER;
         size_t size = 2 * (size_t)count;
+        int16_t any = 0;
         const int16_t *before = state->low + start, *after = state->after + start;
         memcpy(low, before, size);
         memcpy(high, state->high + start, size);
@@ -162,6 +165,8 @@ static void settle(const state_t *state, const pass_t *pass, Py_ssize_t pixels)
                          ((low[at] < 0) | (after[at] >= middle));
         }
         for (Py_ssize_t at = 0; at < count; at++)
+            any |= darker[at];
+        for (Py_ssize_t at = 0; any && at < count; at++)
             if (darker[at])
                 look(state, pass, start + at, low[at]);
         memcpy(state->lower + start, lower, size);

@@ -24,6 +24,12 @@ from shadowtool.core.half_keys import (
 )
 from shadowtool.core.noise import NoiseModel
 
+try:
+    from shadowtool.core import _robust_plates as _compiled
+except ImportError:
+    # No compiler was there when this was installed.
+    _compiled = None  # type: ignore[assignment]
+
 Float32 = NDArray[np.float32]
 Int16 = NDArray[np.int16]
 Bool = NDArray[np.bool_]
@@ -48,6 +54,8 @@ _LEAST_GROUP = 3
 _UNSEEN, _LOWEST_KEY = np.int16(32767), np.int16(-32000)
 # So many rows at a time stay in the processor's cache.
 _ROWS = 32
+# So many frames are taken in together, where they wait in no more bytes than these.
+_TOGETHER, _WAITING = 8, 64 << 20
 # Where more than this part of a window is darkened, all of it is gone through.
 _DENSE = 0.12
 
@@ -100,6 +108,11 @@ def hide(gray: Int16, where: Bool) -> None:
     np.copyto(gray, _UNSEEN, where=where)
 
 
+def _are_enough(frames: int, size: int) -> bool:
+    """Whether frames of so many bytes wait for no others."""
+    return frames == _TOGETHER or (frames + 1) * size > _WAITING
+
+
 class Levels(NamedTuple):
     """What a sample of frames says of each pixel: gray keys, (H, W) int16.
 
@@ -121,9 +134,23 @@ class SampledLevels:
         shape = height, width
         self._highest = [np.full(shape, _LOWEST_KEY, np.int16) for _ in range(_OUTLIERS + 1)]
         self._lowest = [np.full(shape, _UNSEEN, np.int16) for _ in range(_OUTLIERS + 1)]
+        self._waiting: list[Int16] = []
 
     def add(self, gray: Int16) -> None:
-        """Take in the gray keys of one of the sample's frames, (H, W)."""
+        """Take in the gray keys of one of the sample's frames, (H, W), which are not to change."""
+        if _compiled is None:
+            self._add(gray)
+            return
+        self._waiting.append(gray)
+        if _are_enough(len(self._waiting), gray.nbytes):
+            self._take_in()
+
+    def _take_in(self) -> None:
+        if self._waiting:
+            _compiled.sample(tuple(self._waiting), (*self._highest, *self._lowest))
+            self._waiting.clear()
+
+    def _add(self, gray: Int16) -> None:
         for start in range(0, len(gray), _ROWS):
             rows = slice(start, start + _ROWS)
             own = gray[rows]
@@ -144,6 +171,7 @@ class SampledLevels:
     def levels(self) -> Levels:
         """What was found; where fewer than three frames saw the pixel, ``lit`` is the lowest of
         those, and ``shaded`` above all that is seen."""
+        self._take_in()
         lit = self._highest[-1]
         for brighter in reversed(self._highest[:-1]):
             lit = np.where(lit == _LOWEST_KEY, brighter, lit)
@@ -192,6 +220,11 @@ class _Group:
         self.gray = np.zeros((height, width), np.float32)
         self.total = np.zeros((height, width, 3), np.float32)
         self._flat = _Members(self.frames.ravel(), self.gray.ravel(), self.total.reshape(-1, 3))
+
+    @property
+    def parts(self) -> tuple[Float32, Float32, Float32]:
+        """What is known of it."""
+        return self.frames, self.gray, self.total
 
     def at(self, where: Index) -> _Members:
         return self._flat.take(where)
@@ -277,9 +310,34 @@ class RobustPlates:
         self._count = np.zeros((height, width), np.int32)
         # The next group is that of what is shaded where that is known.
         self._lowest, self._next = _Group(height, width), _Group(height, width)
+        self._waiting: list[Keyed] = []
 
     def add(self, frame: Keyed) -> None:
-        """Take in one frame; frames come in the order of the take."""
+        """Take in one frame, which is not to change; frames come in the order of the take."""
+        if _compiled is None:
+            self._add(frame)
+            return
+        self._waiting.append(frame)
+        if _are_enough(len(self._waiting), frame.keys.nbytes + frame.gray.nbytes):
+            self._take_in()
+
+    def _take_in(self) -> None:
+        if not self._waiting:
+            return
+        _compiled.add(
+            tuple(part for frame in self._waiting for part in (frame.keys, frame.gray)),
+            (
+                *(self._lit_low, self._lit_high, self._dark),
+                *(self._shaded_low, self._shaded_high, self._deep),
+            ),
+            self._near,
+            (self._count, self._total),
+            (*self._lowest.parts, *self._next.parts),
+            _LEAST_GROUP,
+        )
+        self._waiting.clear()
+
+    def _add(self, frame: Keyed) -> None:
         founding = []
         for start in range(0, len(frame.gray), _ROWS):
             rows = slice(start, start + _ROWS)
@@ -338,6 +396,7 @@ class RobustPlates:
 
     def measured(self) -> Measured:
         """The plates so far."""
+        self._take_in()
         shape = self._count.shape
         lit, shadow = np.empty((*shape, 3), np.float32), np.full((*shape, 3), np.nan, np.float32)
         lit_frames, shadow_frames = self._count.astype(np.uint32), np.zeros(shape, np.uint32)

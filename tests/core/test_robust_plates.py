@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from shadowtool.core import robust_plates
 from shadowtool.core.half_keys import mean_of_keys
 from shadowtool.core.noise import NoiseModel
 from shadowtool.core.plates import ExtremePlates
@@ -379,3 +380,84 @@ def test_memory_does_not_grow_with_the_frames() -> None:
     few, many = peak(add, 2), peak(add, 200)
     tracemalloc.stop()
     assert many < few + SCENE.lit.nbytes
+
+
+def any_take(seed: int, negative: bool) -> tuple[list[np.ndarray], Holdouts]:
+    """Lit and shaded frames, birds of all brightnesses, noise, NaN, and what is held out."""
+    rng = np.random.default_rng(seed)
+    height, width = rng.integers(1, 40, 2)
+    lit = rng.uniform(-0.01 if negative else 0.01, 1, (height, width, 3))
+    frames: list[np.ndarray] = []
+    holdouts: Holdouts = []
+    for _ in range(rng.integers(1, 40)):
+        frame = lit * rng.choice([1, 0.3, 0.1, 0.32], (height, width, 1), p=[0.5, 0.3, 0.1, 0.1])
+        frame = frame + rng.normal(scale=0.002, size=frame.shape)
+        frame[rng.random((height, width)) < 0.03] = rng.choice([2, 1e-3, np.nan, np.inf])
+        frames.append((frame if negative else np.abs(frame)).astype(np.float16))
+        holdouts.append((rng.random((height, width)) < 0.1).astype(np.uint8))
+    return frames, holdouts
+
+
+@pytest.mark.skipif(robust_plates._compiled is None, reason="installed without a compiler")
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.sampled_from([1, 10_000, 64 << 20]))
+def test_compiled_or_not_and_few_at_a_time_or_many_the_same_plates_are_found(
+    seed: int, negative: bool, waiting: int
+) -> None:
+    frames, holdouts = any_take(seed, negative)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robust_plates, "_WAITING", waiting)
+        found = measure(frames, holdouts)
+        patch.setattr(robust_plates, "_compiled", None)
+        assert same(found, measure(frames, holdouts))
+
+
+@pytest.mark.skipif(robust_plates._compiled is None, reason="installed without a compiler")
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"frames": 0},
+        {"frames": 9},
+        {"odd": True},
+        {"keys": (4, 5, 2)},
+        {"gray": (4, 6)},
+        {"bounds": 5},
+        {"bound": "f4"},
+        {"near": (3, 5)},
+        {"lit": 1},
+        {"total": (4, 5)},
+        {"groups": 5},
+        {"group": "f8"},
+    ],
+)
+def test_what_does_not_fit_together_is_not_taken_in(wrong: dict) -> None:
+    def add(
+        frames=2, odd=False, keys=(4, 5, 3), gray=(4, 5), bounds=6, bound="i2", near=(4, 5),
+        lit=2, total=(4, 5, 3), groups=6, group="f4",
+    ):  # fmt: skip
+        one = np.zeros(keys, "i2"), np.zeros(gray, "i2")
+        shapes = [(4, 5), (4, 5), (4, 5, 3)] * 2
+        robust_plates._compiled.add(
+            (one * frames)[odd:],
+            tuple(np.zeros((4, 5), bound) for _ in range(bounds)),
+            np.zeros(near, "f4"),
+            (np.zeros((4, 5), "i4"), np.zeros(total, "f4"))[:lit],
+            tuple(np.zeros(shape, group) for shape in shapes[:groups]),
+            3,
+        )
+
+    add()
+    with pytest.raises((ValueError, IndexError)):
+        add(**wrong)
+
+
+@pytest.mark.skipif(robust_plates._compiled is None, reason="installed without a compiler")
+@pytest.mark.parametrize(("frames", "gray", "kept"), [(0, 4, 6), (9, 4, 6), (2, 5, 6), (2, 4, 5)])
+def test_grays_that_do_not_fit_together_are_not_sampled(frames: int, gray: int, kept: int) -> None:
+    with pytest.raises((ValueError, IndexError)):
+        robust_plates._compiled.sample(
+            (np.zeros((4, 4), "i2"), *(np.zeros((4, gray), "i2") for _ in range(frames - 1)))
+            if frames
+            else (),
+            tuple(np.zeros((4, 4), "i2") for _ in range(kept)),
+        )

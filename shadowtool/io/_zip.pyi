@@ -4,7 +4,7 @@ from numpy.typing import NDArray
 
 def unzip(
     inflate: int,
-    data: bytes,
+    data: bytes | bytearray,
     table: memoryview,
     target: NDArray[Any],
     top: int,

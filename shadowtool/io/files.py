@@ -82,6 +82,17 @@ def _known_as(path: Path, version: _Version) -> tuple[_Version, str]:
     return version, fingerprint_file(path)
 
 
+class _Spare(threading.local):
+    """Memory that the thread has read files into, and may again: new memory takes as long as
+    reading does."""
+
+    def __init__(self) -> None:
+        self.buffers: list[bytearray] = []
+
+
+_spare = _Spare()
+
+
 class File:
     """A file that is being read.
 
@@ -93,9 +104,22 @@ class File:
         self._path, self._mark = path, mark
 
     @cached_property
-    def content(self) -> bytes:
-        """All of it."""
-        return read_bytes(self._path)
+    def content(self) -> bytearray:
+        """All of it, as long as the file is being read; the next one may overwrite it."""
+        with _reading(self._path), io.FileIO(self._path) as file:
+            buffer = _buffer(os.fstat(file.fileno()).st_size)
+            filled = 0
+            with memoryview(buffer) as whole:
+                while count := file.readinto(whole[filled:]):
+                    filled += count
+            # It is shorter, or longer, only where it changed.
+            del buffer[filled:]
+            return buffer
+
+    def close(self) -> None:
+        """Nobody looks at the content any more."""
+        if "content" in self.__dict__:
+            _spare.buffers.append(self.__dict__.pop("content"))
 
     @cached_property
     def source(self) -> str | BinaryIO:
@@ -121,14 +145,29 @@ def unchanging(path: Path) -> Iterator[File]:
             whatever came of it.
     """
     version, mark = _known.files.get(path) or (_version(path), None)
+    file = File(path, mark)
     try:
-        yield File(path, mark)
+        yield file
     except ShadowtoolError:
         if _version(path) != version:
             raise _changed(path) from None
         raise
+    finally:
+        file.close()
     if _version(path) != version:
         raise _changed(path)
+
+
+def _buffer(size: int) -> bytearray:
+    """Memory of so many bytes, that the thread had before if it may be."""
+    while _spare.buffers:
+        buffer = _spare.buffers.pop()
+        # It is lost to whoever still looks at what was in it: then no size can be changed.
+        with contextlib.suppress(BufferError):
+            buffer.extend(bytes(max(size + 1 - len(buffer), 0)))
+            del buffer[size:]
+            return buffer
+    return bytearray(size)
 
 
 def read_content(path: Path) -> Content:
@@ -314,7 +353,7 @@ def _alive(pid: str) -> bool:
     return True
 
 
-def fingerprint(data: bytes) -> str:
+def fingerprint(data: bytes | bytearray) -> str:
     """What stands for a file's content: its size and a checksum.
 
     It tells whether an input changed between two runs, not whether somebody forged it. The CRC-32
@@ -333,7 +372,7 @@ class _Checksum:
         self._rest = b""
         self._size = 0
 
-    def add(self, data: bytes | memoryview) -> None:
+    def add(self, data: bytes | bytearray | memoryview) -> None:
         """Take in the next bytes; a multiple of the fold's but for the last."""
         words = np.frombuffer(data, np.uint64, len(data) // (8 * _FOLD) * _FOLD)
         self._folded ^= np.bitwise_xor.reduce(words.reshape(-1, _FOLD), axis=0)

@@ -126,7 +126,7 @@ def _at_hand() -> bool:
 
 
 def decode(
-    data: bytes, apart: bool = False, make: Make | None = None
+    data: bytes | bytearray, apart: bool = False, make: Make | None = None
 ) -> dict[str, NDArray[Any]] | None:
     """Channels by name, of the data window's size; float16, float32 or uint32.
 
@@ -214,7 +214,7 @@ def encode(one_pixel: bytes, channels: Mapping[str, NDArray[Any]], level: int) -
     return target.data[:place]
 
 
-def _attributes(data: bytes) -> tuple[dict[bytes, slice], int]:
+def _attributes(data: bytes | bytearray) -> tuple[dict[bytes, slice], int]:
     """Where in a file the attributes' contents lie, by name, and where the header ends.
 
     Raises:
@@ -226,7 +226,7 @@ def _attributes(data: bytes) -> tuple[dict[bytes, slice], int]:
         # Name, type, size and content.
         middle = data.index(0, at)
         end = data.index(0, middle + 1)
-        name, kind = data[at:middle], data[middle + 1 : end]
+        name, kind = bytes(data[at:middle]), bytes(data[middle + 1 : end])
         (size,) = struct.unpack_from("<I", data, end + 1)
         at = end + 5 + size
         if name in found or _WANTED.get(name, (kind, size)) != (kind, size):
@@ -237,15 +237,15 @@ def _attributes(data: bytes) -> tuple[dict[bytes, slice], int]:
     return found, at + 1
 
 
-def _layout(data: bytes) -> _Layout:
+def _layout(data: bytes | bytearray) -> _Layout:
     """What the header says. Raises as `_attributes`."""
     parts, end = _attributes(data)
     left, top, right, bottom = struct.unpack("<4i", data[parts[b"dataWindow"]])
     width, height = right - left + 1, bottom - top + 1
     if width < 1 or height < 1:
         raise ValueError("no pixels")
-    channels, length = _channels(data[parts[b"channels"]], width)
-    compression = data[parts[b"compression"]]
+    channels, length = _channels(bytes(data[parts[b"channels"]]), width)
+    compression = bytes(data[parts[b"compression"]])
     rows, packed = _ROWS[compression], compression != b"\x00"
     return _Layout(top, width, height, packed, rows, length, channels, end)
 
@@ -286,7 +286,7 @@ class _Chunks:
         _DamagedError: the file isn't whole.
     """
 
-    def __init__(self, data: bytes, layout: _Layout, inflate: int) -> None:
+    def __init__(self, data: bytes | bytearray, layout: _Layout, inflate: int) -> None:
         if layout.height * layout.length > _MOST_INFLATED * len(data):
             raise _DamagedError("more pixels than the file has room for")
         self.count = -(-layout.height // layout.rows)

@@ -320,6 +320,30 @@ def test_a_file_is_read_once_or_decoded_by_its_name(tmp_path):
         assert (file.content, file.fingerprint()) == (b"first", fingerprint(b"first"))
 
 
+def test_each_file_that_is_being_read_has_a_content_of_its_own(tmp_path):
+    paths = [tmp_path / name for name in "abc"]
+    contents = [b"a" * 5000, b"bb", b"c" * 9000]
+    for path, content in zip(paths, contents, strict=True):
+        path.write_bytes(content)
+    for _ in range(2):
+        with unchanging(paths[0]) as one, unchanging(paths[1]) as other:
+            assert (bytes(one.content), bytes(other.content)) == (contents[0], contents[1])
+            with unchanging(paths[2]) as third:
+                assert bytes(third.content) == contents[2]
+            assert (bytes(one.content), bytes(other.content)) == (contents[0], contents[1])
+
+
+def test_what_is_still_looked_at_is_not_overwritten(tmp_path):
+    one, other = tmp_path / "a", tmp_path / "b"
+    one.write_bytes(b"1" * 100)
+    other.write_bytes(b"2" * 100)
+    with unchanging(one) as file:
+        view = memoryview(file.content)
+    with unchanging(other) as file:
+        assert bytes(file.content) == b"2" * 100
+    assert bytes(view) == b"1" * 100
+
+
 @pytest.mark.parametrize("replaced", [True, False])
 def test_a_file_that_changes_while_it_is_decoded_is_worth_a_retry(replaced, tmp_path):
     path, other = tmp_path / "a", tmp_path / "b"

@@ -12,6 +12,12 @@ from numpy.typing import NDArray
 from shadowtool.core.bands import blocks
 from shadowtool.core.noise import NoiseModel
 
+try:
+    from shadowtool.core import _color_line as _compiled
+except ImportError:
+    # No compiler was there when this was installed.
+    _compiled = None  # type: ignore[assignment]
+
 Float32 = NDArray[np.float32]
 
 # So many pixels at a time stay in the processor's cache.
@@ -80,6 +86,11 @@ class Weighed:
 
     def nearest(self, lit: Float32, shadow: Float32) -> tuple[Float32, Float32]:
         """The same, and where on the line the nearest point is: 0 at S, 1 at L; (N,) each."""
+        if _compiled is not None:
+            distance, part = (np.empty(lit.shape[1], np.float32) for _ in range(2))
+            parts = (self._colours, self._weight, lit, shadow)
+            _compiled.nearest(*map(_in_rows, parts), distance, part)
+            return distance, part
         with np.errstate(invalid="ignore", over="ignore"):
             direction = lit - shadow
             direction *= self._weight
@@ -96,5 +107,13 @@ class Weighed:
         return np.asarray(np.minimum(distance, 1e6, out=distance), np.float32), part
 
 
+def _in_rows(channels: Float32) -> Float32:
+    """Channels (3, N), the numbers of each of which follow each other."""
+    return channels if channels.strides[1] == channels.itemsize else channels.copy("C")
+
+
 def _dot(one: Float32, other: Float32) -> Float32:
-    return np.asarray(np.einsum("cn,cn->n", one, other))
+    total: Float32 = one[0] * other[0]
+    for channel in (1, 2):
+        total += one[channel] * other[channel]
+    return total

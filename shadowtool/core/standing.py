@@ -197,7 +197,9 @@ class Sampled:
 
 
 def _explained(samples: list[Weighed], lit: Float32, ratio: Float32 | np.float32) -> Bool:
-    return np.stack([s.line_distance(lit, lit * ratio) <= _ON_LINE for s in samples])
+    lit = np.ascontiguousarray(lit)
+    shadow = np.ascontiguousarray(lit * ratio)
+    return np.stack([sample.line_distance(lit, shadow) <= _ON_LINE for sample in samples])
 
 
 def _places(mask: Bool) -> Iterator[Bool]:

@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shadowtool.core.color_line import line_distance
+from shadowtool.core import color_line
+from shadowtool.core.color_line import Weighed, line_distance
 from shadowtool.core.noise import NoiseModel
 from tests.scene import Scene
 
@@ -120,3 +121,46 @@ def test_a_large_picture_is_its_pixels() -> None:
     for rows in (slice(0, 7), slice(95, 120), slice(200, 210)):
         part = line_distance(image[rows], lit[rows], 0.2 * lit[rows], CAMERA, 0.01)
         assert np.array_equal(whole[rows], part)
+
+
+compiled = pytest.mark.skipif(color_line._compiled is None, reason="installed without a compiler")
+
+
+@compiled
+@given(st.integers(0, 700), st.integers(0, 2**32 - 1), st.booleans())
+def test_compiled_or_not_the_same_distances_are_found(count: int, seed: int, few: bool) -> None:
+    """Colours on the line, off it, beyond its ends, and of nothing and anything."""
+    rng = np.random.default_rng(seed)
+    lit = rng.uniform(0.01, 1, (3, count)).astype(np.float32)
+    shadow = lit * rng.uniform(0, 1.1, (3, 1)).astype(np.float32)
+    colours = shadow + (lit - shadow) * rng.uniform(-0.5, 1.5, count).astype(np.float32)
+    colours += rng.normal(scale=0.05, size=colours.shape).astype(np.float32)
+    for values in (lit, shadow, colours):
+        strange = rng.random(values.shape) < 0.03
+        values[strange] = rng.choice([0, -1, 1e30, np.nan, np.inf, -np.inf], strange.sum())
+    with np.errstate(all="ignore"):
+        weighed = Weighed(colours, CAMERA, 0.02)
+    if few:
+        # Rows that don't follow each other.
+        weighed, lit, shadow = weighed.part(slice(1, -1)), lit[:, 1:-1], shadow[:, 1:-1]
+    found = weighed.nearest(lit, shadow)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(color_line, "_compiled", None)
+        expected = weighed.nearest(lit, shadow)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@compiled
+@pytest.mark.parametrize(
+    "wrong", [{"lit": (3, 4)}, {"lit": (2, 5)}, {"kind": "f8"}, {"found": 4}, {"found": 6}]
+)
+def test_colours_and_lines_that_do_not_fit_together_are_not_compared(wrong: dict) -> None:
+    def nearest(lit=(3, 5), kind="f4", found=5):
+        parts = np.ones((3, 5), "f4"), np.ones((3, 5), "f4"), np.ones(lit, "f4")
+        out = np.empty(found, "f4")
+        color_line._compiled.nearest(*parts, np.ones((3, 5), kind), out, out.copy())
+
+    nearest()
+    with pytest.raises(ValueError):
+        nearest(**wrong)

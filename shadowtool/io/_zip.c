@@ -35,20 +35,16 @@ static uint8_t total(const uint8_t *bytes, Py_ssize_t size)
 }
 
 #ifdef __SSE2__
-/* Sixteen bytes added up, from what comes before them on; it becomes the last in every place. */
-static inline __m128i added_up(const uint8_t *bytes, __m128i *before)
+/* Eight pairs of bytes added up, from what comes before them on. */
+static inline __m128i added_up(__m128i pairs, __m128i *before)
 {
-    __m128i sums = _mm_loadu_si128((const __m128i *)bytes);
-    sums = _mm_xor_si128(sums, _mm_set1_epi8((char)128));
-    sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 1));
-    sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 2));
-    sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 4));
-    sums = _mm_add_epi8(sums, _mm_slli_si128(sums, 8));
-    __m128i result = _mm_add_epi8(sums, *before);
-    /* Only one addition waits for the round before. */
-    __m128i last = _mm_srli_si128(sums, 15);
-    last = _mm_shufflelo_epi16(_mm_unpacklo_epi8(last, last), 0);
-    *before = _mm_add_epi8(*before, _mm_unpacklo_epi64(last, last));
+    pairs = _mm_add_epi8(pairs, _mm_slli_si128(pairs, 2));
+    pairs = _mm_add_epi8(pairs, _mm_slli_si128(pairs, 4));
+    pairs = _mm_add_epi8(pairs, _mm_slli_si128(pairs, 8));
+    __m128i result = _mm_add_epi8(pairs, *before);
+    /* The last of them in every place. Only one addition waits for the round before. */
+    pairs = _mm_shufflehi_epi16(pairs, 0xFF);
+    *before = _mm_add_epi8(*before, _mm_unpackhi_epi64(pairs, pairs));
     return result;
 }
 #endif
@@ -61,17 +57,19 @@ static void restore(const uint8_t *sorted, uint8_t *target, Py_ssize_t size)
     /* One half goes on where the other ends. */
     uint8_t last_even = 128, last_odd = (uint8_t)(128 + total(even, (size + 1) / 2));
 #ifdef __SSE2__
-    __m128i before_even = _mm_set1_epi8((char)last_even);
-    __m128i before_odd = _mm_set1_epi8((char)last_odd);
+    /* What comes before, and the 128 of each difference: an odd number of them in every other
+     * place, and of eight pairs nothing. */
+    __m128i before = _mm_set1_epi16((int16_t)(last_even | last_odd << 8));
+    before = _mm_xor_si128(before, _mm_set1_epi32(0x8080));
     for (; at + 16 <= pairs; at += 16) {
-        __m128i first = added_up(even + at, &before_even);
-        __m128i second = added_up(odd + at, &before_odd);
+        __m128i first = _mm_loadu_si128((const __m128i *)(even + at));
+        __m128i second = _mm_loadu_si128((const __m128i *)(odd + at));
         __m128i *place = (__m128i *)(target + 2 * at);
-        _mm_storeu_si128(place, _mm_unpacklo_epi8(first, second));
-        _mm_storeu_si128(place + 1, _mm_unpackhi_epi8(first, second));
+        _mm_storeu_si128(place, added_up(_mm_unpacklo_epi8(first, second), &before));
+        _mm_storeu_si128(place + 1, added_up(_mm_unpackhi_epi8(first, second), &before));
     }
-    last_even = (uint8_t)_mm_cvtsi128_si32(before_even);
-    last_odd = (uint8_t)_mm_cvtsi128_si32(before_odd);
+    last_even = (uint8_t)(_mm_extract_epi16(before, 1) & 0xFF);
+    last_odd = (uint8_t)(_mm_extract_epi16(before, 1) >> 8);
 #endif
     for (; at < pairs; at++) {
         target[2 * at] = last_even = (uint8_t)(last_even + even[at] - 128);

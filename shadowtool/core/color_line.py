@@ -88,8 +88,9 @@ class Weighed:
         """The same, and where on the line the nearest point is: 0 at S, 1 at L; (N,) each."""
         if _compiled is not None:
             distance, part = (np.empty(lit.shape[1], np.float32) for _ in range(2))
-            parts = (self._colours, self._weight, lit, shadow)
-            _compiled.nearest(*map(_in_rows, parts), distance, part)
+            colours, weight = _in_rows(self._colours), _in_rows(self._weight)
+            lit, shadow = _in_rows(lit), _in_rows(shadow)
+            _compiled.nearest(colours, weight, lit, shadow, distance, part)
             return distance, part
         with np.errstate(invalid="ignore", over="ignore"):
             direction = lit - shadow

@@ -88,6 +88,7 @@ UNDER_A_CARD = "a scene under a card"
 _WELL_SHADED = 0.9
 # So is clipped light in more than this part of the picture.
 _CLIPPED = 0.01
+_MID_GREY = np.full(3, 0.18)
 # Sampled frames are kept for the second reading up to so many bytes, as far as these with what the
 # estimate takes for each pixel stay below a gigabyte.
 _KEPT, _WITH_ESTIMATE, _PER_PIXEL = 500 << 20, 1000 << 20, 100
@@ -212,18 +213,18 @@ def plate(
         "held_out": take.held_out(),
         "pixels": pixels,
         "unseen": unseen,
-        "clipped": round(estimate.clipped, 4),
-        "noise_at_mid_grey": [round(float(v), 6) for v in estimate.noise.sigma(np.full(3, 0.18))],
     }
 
     def products() -> Iterator[tuple[Path, dict[str, NDArray[np.floating]]]]:
         # Each is encoded while the next one is made.
         lit, shadow, confidence = plate_files(output)
         yield lit, {"RGB": estimate.lit}
-        plates, more = estimate.complete()
-        yield shadow, {"RGB": plates.shadow}
+        plates, noise, clipped, more = estimate.complete()
+        figures["clipped"] = round(clipped, 4)
+        figures["noise_at_mid_grey"] = [round(float(v), 6) for v in noise.sigma(_MID_GREY)]
         figures.update(more)
-        contrast = shadow_contrast(plates, estimate.noise)
+        contrast = shadow_contrast(plates, noise)
+        yield shadow, {"RGB": plates.shadow}
         yield confidence, confidence_layers(plates, contrast)
 
     def write(item: tuple[Path, dict[str, NDArray[np.floating]]]) -> None:
@@ -328,14 +329,20 @@ def _nothing_seen(take: "_Take") -> str:
     )
 
 
-class _Estimate(NamedTuple):
-    """The lit plate, the take's noise, how much of it is clipped, and how to come by the rest of
-    the plates."""
+class _Completed(NamedTuple):
+    """Both plates, the take's noise, how much of it is clipped, and what else is to be recorded."""
 
-    lit: NDArray[np.float32]
+    plates: Plates
     noise: NoiseModel
     clipped: float
-    complete: Callable[[], tuple[Plates, Figures]]
+    figures: Figures
+
+
+class _Estimate(NamedTuple):
+    """The lit plate, and how to come by the rest."""
+
+    lit: NDArray[np.float32]
+    complete: Callable[[], _Completed]
 
 
 class _Shown(NamedTuple):
@@ -635,9 +642,12 @@ def _extremes(take: _Take, frames: list[Frame], automatic: bool) -> _Estimate:
         if position in numbers:
             thinned[numbers[position]] = thin(item.values)
     plates = extremes.plates()
-    noise = noise_model(noise_levels(thinned))
-    clipped = clipped_part(list(thinned.values()), take.footage.top)
-    return _Estimate(plates.lit, noise, clipped, lambda: (plates, {}))
+
+    def complete() -> _Completed:
+        noise = noise_model(noise_levels(thinned))
+        return _Completed(plates, noise, clipped_part(list(thinned.values()), take.footage.top), {})
+
+    return _Estimate(plates.lit, complete)
 
 
 def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | None) -> _Estimate:
@@ -656,7 +666,7 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
 
     ratio = None if take.background is None else take.background.ratio
 
-    def complete() -> tuple[Plates, Figures]:
+    def complete() -> _Completed:
         completed = complete_shadow(
             lit, found.shadow, found.shadow_frames, noise, region, take.card, ratio
         )
@@ -673,9 +683,9 @@ def _robust(take: _Take, frames: list[Frame], automatic: bool, region: Bool | No
             "own_evidence": round(float(completed.own[seen].mean()), 4) if seen.any() else 0.0,
             "read_as": reading if shaded.any() else "a scene without shadow",
         }
-        return plates, figures
+        return _Completed(plates, noise, clipped, figures)
 
-    return _Estimate(lit, noise, clipped, complete)
+    return _Estimate(lit, complete)
 
 
 def _other_holdouts(folder: Path, take: "_Take", given: Sequence | None) -> list[Path]:

@@ -64,7 +64,8 @@ class Weighed:
             np.sqrt(sigma, out=sigma)
             value *= np.float32(tolerance)
             sigma += value
-            self._weight = 1 / np.maximum(sigma, np.float32(1e-6), out=sigma)
+            np.maximum(sigma, np.float32(1e-6), out=sigma)
+            self._weight: Float32 = np.divide(1, sigma, out=sigma)
         self._colours = colours
 
     def part(self, where: slice) -> "Weighed":

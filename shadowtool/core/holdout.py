@@ -17,6 +17,7 @@ from shadowtool.core.bands import blocks
 from shadowtool.core.color_line import Weighed, channels, line_distance
 from shadowtool.core.common_ratio import common_ratio, ratio_scatter, usually_bright
 from shadowtool.core.noise import NoiseModel
+from shadowtool.core.ordering import ascending
 from shadowtool.core.regions import large_parts
 from shadowtool.core.samples import mean_where, ranked
 from shadowtool.core.standing import Sampled
@@ -95,15 +96,14 @@ def find_background(samples: list[Float32], noise: NoiseModel) -> Background:
     stack = np.stack([channels(sample) for sample in samples])
     stack = np.nan_to_num(stack, copy=False, nan=0.0, posinf=1e4, neginf=0.0)
     weighed = [Weighed(colours, noise, _TOLERANCE) for colours in stack]
-    # Of equals the first, on any processor.
-    ascending = np.argsort(stack.sum(axis=1), axis=0, kind="stable")
-    bright = usually_bright(stack, ascending)
-    common = common_ratio(stack, bright, ascending, noise, shape[:2])
+    order = np.ascontiguousarray(ascending(np.ascontiguousarray(stack.sum(axis=1).T)).T)
+    bright = usually_bright(stack, order)
+    common = common_ratio(stack, bright, order, noise, shape[:2])
     ratio = np.full(stack.shape[1:], _ANY_RATIO, np.float32) if common is None else common
     lit = np.empty_like(ratio)
     for part in blocks(lit.shape[1], _BLOCK):
         samples_part = [sample.part(part) for sample in weighed]
-        of_points = stack[..., part], ascending[:, part], samples_part, ratio[:, part]
+        of_points = stack[..., part], order[:, part], samples_part, ratio[:, part]
         lit[:, part] = _most_supported(*of_points)
     known = Sampled(stack, weighed, lit, ratio, shape[:2]).uncovered()
     lit, on_line = known.lit, list(known.on_line)

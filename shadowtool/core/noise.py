@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shadowtool.core.exposure import Gains, row_gains, without_gain
+from shadowtool.core.ordering import ascending
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -295,7 +296,7 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
         count = len(difference) // _LEVELS
         spread = np.empty((4, _LEVELS, 3))
         for channel in range(3):
-            order = _ascending(brighter[:, channel])
+            order = ascending(brighter[:, channel])
             rows = order[: count * _LEVELS].reshape(_LEVELS, count)
             own = difference[rows, channel]
             middle, quantile = np.quantile(own, (0.5, part[0]), axis=1)
@@ -306,14 +307,6 @@ def _spreads(pairs: list[tuple[Float32, Float32]], part: tuple[float, float]) ->
             spread[3, :, channel] = _code_steps(first[usable][rows, channel])
         spreads.append(spread)
     return spreads
-
-
-def _ascending(values: Float32) -> NDArray[np.int64]:
-    """The stable order of finite values (N,), by a sort of what cannot tie: many times faster."""
-    # Adding 0 makes one zero of the two.
-    bits = (values + np.float32(0)).view(np.int32)
-    keys = (bits ^ ((bits >> 31) & np.int32(0x7FFFFFFF))).astype(np.int64)
-    return np.sort(keys << 32 | np.arange(len(keys))) & 0xFFFFFFFF
 
 
 def _heaviness(pairs: list[tuple[Float32, Float32]], share: float, noise: NoiseModel) -> Float64:

@@ -3,15 +3,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from shadowtool.core.noise import (
     NoiseLevel,
     NoiseModel,
     NoiseSamples,
-    _ascending,
     extreme_range,
     noise_levels,
     noise_model,
@@ -240,11 +236,6 @@ def test_dark_levels_in_which_all_moved_do_not_raise_the_noise() -> None:
     # Clipped lights without noise do not lower it either.
     clipped = [replace(level, sigma=0.0) if level.value > 0.85 else level for level in clean]
     assert noise_model(clipped).sigma(dark) == pytest.approx(sigma, rel=0.3)
-
-
-@given(hnp.arrays(np.float32, st.integers(0, 60), elements=st.floats(-4, 4, width=16)))
-def test_values_are_put_in_the_order_of_a_stable_sort(values: np.ndarray) -> None:
-    assert np.array_equal(_ascending(values), np.argsort(values, kind="stable"))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

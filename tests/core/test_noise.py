@@ -238,6 +238,24 @@ def test_dark_levels_in_which_all_moved_do_not_raise_the_noise() -> None:
     assert noise_model(clipped).sigma(dark) == pytest.approx(sigma, rel=0.3)
 
 
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (5, 7, 3), (4096, 3), (3, 1366, 3), (2, 9000, 3)])
+@pytest.mark.parametrize("dark", [None, (np.array([1e-3, 2e-3, 0]), np.array([1e-6, 0, 1e-5]))])
+def test_variance_is_that_of_the_lower_line(shape: tuple[int, ...], dark: tuple | None) -> None:
+    model = NoiseModel(np.array([1e-4, 2e-4, 3e-4]), np.array([1e-5, 2e-5, 3e-5]), dark)
+    image = np.random.default_rng(0).uniform(-0.1, 1, shape).astype(np.float32)
+    image[image > 0.98] = np.nan
+    before = image.copy()
+    value = np.maximum(image, 0)
+    lines = [(model.slope, model.floor), *([dark] if dark else [])]
+    each = [value * slope.astype("f4") + floor.astype("f4") for slope, floor in lines]
+    expected = each[0] if len(each) == 1 else np.minimum(*each)
+    for own in (image, np.asfortranarray(image)):
+        np.testing.assert_array_equal(model.variance(own), expected)
+    channel = model.channel_variance(np.ascontiguousarray(value[..., 1]), 1)
+    np.testing.assert_array_equal(channel, expected[..., 1])
+    np.testing.assert_array_equal(image, before)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_pixel_that_is_no_number_changes_next_to_nothing(value: float) -> None:
     shots = take(24)

@@ -26,6 +26,22 @@ static inline const Py_buffer *hold(held_t *held, PyObject *array, Py_ssize_t it
     return NULL;
 }
 
+/* What an array of so many numbers an item holds, each of so many bytes; NULL, with an error set, if
+ * it is something else. Items are as many in all; a count below 0 is that of this one. */
+static inline void *hold_as_many(held_t *held, PyObject *array, Py_ssize_t size, Py_ssize_t each,
+                                 int flags, Py_ssize_t *count)
+{
+    const Py_buffer *own = hold(held, array, size, PyBUF_C_CONTIGUOUS | flags);
+    if (!own)
+        return NULL;
+    if (*count < 0)
+        *count = own->len / size / each;
+    if (own->len == *count * each * size)
+        return own->buf;
+    PyErr_SetString(PyExc_ValueError, "arrays that are not as large");
+    return NULL;
+}
+
 /* Whether arrays have one shape. */
 static inline int alike(const Py_buffer *one, const Py_buffer *other)
 {
@@ -42,6 +58,9 @@ static inline PyObject *let_go(held_t *held)
         return NULL;
     Py_RETURN_NONE;
 }
+
+static inline int16_t least(int16_t one, int16_t other) { return one < other ? one : other; }
+static inline int16_t most(int16_t one, int16_t other) { return one > other ? one : other; }
 
 /* The value of a half that is not negative, by its bits; of one that is finite, if `finite`. */
 static inline float value_of_bits(uint32_t half, int finite)

@@ -32,9 +32,6 @@ typedef struct {
     int16_t nearly_lit_keys;
 } pass_t;
 
-static inline int16_t least(int16_t one, int16_t other) { return one < other ? one : other; }
-static inline int16_t most(int16_t one, int16_t other) { return one > other ? one : other; }
-
 /* The key of a value rounded to a half. */
 static inline int16_t key_of(float value)
 {

@@ -198,13 +198,7 @@ static int hold_all(held_t *held, PyObject *arrays, int wanted, int flags, void 
         parts[index] = NULL;
         if (item == Py_None && (index == DARK_ROUGH || index == LIT_ROUGH))
             continue;
-        const Py_buffer *own = hold(held, item, 4, PyBUF_C_CONTIGUOUS | flags);
-        if (own && *count >= 0 && own->len != 4 * *count)
-            PyErr_SetString(PyExc_ValueError, "arrays that are not as large");
-        if (!own || PyErr_Occurred())
-            break;
-        *count = own->len / 4;
-        parts[index] = own->buf;
+        parts[index] = hold_as_many(held, item, 4, 1, flags, count);
     }
     return !PyErr_Occurred();
 }

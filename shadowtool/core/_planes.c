@@ -150,7 +150,7 @@ typedef struct {
     double factor, radius, weight, level, floor, misfit;
 } terms_t;
 
-static inline double most(double one, double other)
+static inline double larger(double one, double other)
 {
     return one > other ? one : other;
 }
@@ -173,11 +173,11 @@ static inline void solve_some(const double *const *sums, float (*planes)[TOGETHE
         double wxx = part[3][at] + terms.level - wx * x, wxy = part[4][at] - wx * y;
         double wyy = part[5][at] + terms.level - wy * y;
         double wvx = part[7][at] - x * wv, wvy = part[8][at] - y * wv, wvv = part[9][at] - v * wv;
-        double second = 1 / most(wyy, terms.level), slant = wxy * second;
-        double first = 1 / most(wxx - slant * wxy, terms.level);
+        double second = 1 / larger(wyy, terms.level), slant = wxy * second;
+        double first = 1 / larger(wxx - slant * wxy, terms.level);
         double b = first * (wvx - slant * wvy), c = second * wvy - slant * b;
-        double misfit = (wvv - (b * wvx + c * wvy)) / most(used - 3, 1);
-        double worse = most(misfit, 1) * terms.factor;
+        double misfit = (wvv - (b * wvx + c * wvy)) / larger(used - 3, 1);
+        double worse = larger(misfit, 1) * terms.factor;
         double p = sqrt(first * worse), q = sqrt(second * worse), px = p * terms.radius;
         float alone = (float)(inverse * worse + terms.floor);
         planes[A][at] = (float)(v - (b * x + c * y));

@@ -13,9 +13,6 @@
 #define TOGETHER 128
 #define RUN 16
 
-static inline int16_t least(int16_t one, int16_t other) { return one < other ? one : other; }
-static inline int16_t most(int16_t one, int16_t other) { return one > other ? one : other; }
-
 /* How many of the highest and of the lowest keys are kept. */
 enum { KEPT = 3 };
 
@@ -153,23 +150,6 @@ static void add(const plates_t *plates, const int16_t *keys, const int16_t *gray
             found(plates, start + at, own[at], keys + 3 * at, least_group);
 }
 
-/* What an array of so many numbers a pixel holds, each of so many bytes; NULL, with an error set, if
- * it is something else. The first one tells how many pixels there are. */
-static void *part(held_t *held, PyObject *array, Py_ssize_t size, Py_ssize_t each, int writable,
-                  Py_ssize_t *pixels)
-{
-    const Py_buffer *own =
-        hold(held, array, size, PyBUF_C_CONTIGUOUS | (writable ? PyBUF_WRITABLE : 0));
-    if (!own)
-        return NULL;
-    if (*pixels < 0)
-        *pixels = own->len / size / each;
-    if (own->len == *pixels * each * size)
-        return own->buf;
-    PyErr_SetString(PyExc_ValueError, "arrays of several sizes");
-    return NULL;
-}
-
 /* So many frames at most are taken in together. */
 enum { FRAMES = 8 };
 
@@ -195,10 +175,11 @@ static PyObject *py_sample(PyObject *module, PyObject *arguments)
         return NULL;
     int count = frames_of(frames, 1);
     for (int frame = 0; frame < count; frame++)
-        grays[frame] = part(&held, PyTuple_GetItem(frames, frame), 2, 1, 0, &pixels);
-    for (int place = 0; place < 2 * KEPT && !PyErr_Occurred(); place++) {
-        int16_t *own = part(&held, PyTuple_GetItem(kept, place), 2, 1, 1, &pixels);
-        (place < KEPT ? highest : lowest)[place % KEPT] = own;
+        grays[frame] = hold_as_many(&held, PyTuple_GetItem(frames, frame), 2, 1, 0, &pixels);
+    for (int place = 0; place < 2 * KEPT; place++) {
+        PyObject *item = PyTuple_GetItem(kept, place);
+        int16_t **own = (place < KEPT ? highest : lowest) + place % KEPT;
+        *own = hold_as_many(&held, item, 2, 1, PyBUF_WRITABLE, &pixels);
     }
     if (!PyErr_Occurred()) {
         Py_BEGIN_ALLOW_THREADS
@@ -225,17 +206,23 @@ static PyObject *py_add(PyObject *module, PyObject *arguments)
         return NULL;
     int count = frames_of(frames, 2);
     for (int frame = 0; frame < count; frame++) {
-        grays[frame] = part(&held, PyTuple_GetItem(frames, 2 * frame + 1), 2, 1, 0, &pixels);
-        keys[frame] = part(&held, PyTuple_GetItem(frames, 2 * frame), 2, 3, 0, &pixels);
+        PyObject *item = PyTuple_GetItem(frames, 2 * frame);
+        keys[frame] = hold_as_many(&held, item, 2, 3, 0, &pixels);
+        item = PyTuple_GetItem(frames, 2 * frame + 1);
+        grays[frame] = hold_as_many(&held, item, 2, 1, 0, &pixels);
     }
     for (int place = 0; place < 6; place++)
-        bound[place] = part(&held, PyTuple_GetItem(bounds, place), 2, 1, 0, &pixels);
-    const float *nearness = part(&held, near, 4, 1, 0, &pixels);
-    for (int place = 0; place < 2; place++)
-        sums[place] = part(&held, PyTuple_GetItem(lit, place), 4, place ? 3 : 1, 1, &pixels);
-    for (int place = 0; place < 6; place++)
-        group[place] =
-            part(&held, PyTuple_GetItem(groups, place), 4, place % 3 == 2 ? 3 : 1, 1, &pixels);
+        bound[place] = hold_as_many(&held, PyTuple_GetItem(bounds, place), 2, 1, 0, &pixels);
+    const float *nearness = hold_as_many(&held, near, 4, 1, 0, &pixels);
+    for (int place = 0; place < 2; place++) {
+        PyObject *item = PyTuple_GetItem(lit, place);
+        sums[place] = hold_as_many(&held, item, 4, place ? 3 : 1, PyBUF_WRITABLE, &pixels);
+    }
+    for (int place = 0; place < 6; place++) {
+        PyObject *item = PyTuple_GetItem(groups, place);
+        int each = place % 3 == 2 ? 3 : 1;
+        group[place] = hold_as_many(&held, item, 4, each, PyBUF_WRITABLE, &pixels);
+    }
     if (!PyErr_Occurred()) {
         plates_t plates = {bound[0], bound[1], bound[2], bound[3], bound[4], bound[5],
                            nearness, sums[0],  sums[1],  {group[0], group[1], group[2]},

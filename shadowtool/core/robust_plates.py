@@ -110,7 +110,7 @@ def hide(gray: Int16, where: Bool) -> None:
 
 def _are_enough(frames: int, size: int) -> bool:
     """Whether frames of so many bytes wait for no others."""
-    return frames == _TOGETHER or (frames + 1) * size > _WAITING
+    return frames >= _TOGETHER or (frames + 1) * size > _WAITING
 
 
 class Levels(NamedTuple):
@@ -137,7 +137,14 @@ class SampledLevels:
         self._waiting: list[Int16] = []
 
     def add(self, gray: Int16) -> None:
-        """Take in the gray keys of one of the sample's frames, (H, W), which are not to change."""
+        """Take in the gray keys of one of the sample's frames, (H, W), which are not to change
+        until `levels` is asked for: up to eight frames wait, or 64 MB of them.
+
+        Raises:
+            ValueError: it is of another size.
+        """
+        if gray.shape != self._lowest[0].shape:
+            raise ValueError(f"a frame of {gray.shape} among frames of {self._lowest[0].shape}")
         if _compiled is None:
             self._add(gray)
             return
@@ -146,9 +153,9 @@ class SampledLevels:
             self._take_in()
 
     def _take_in(self) -> None:
-        if self._waiting:
-            _compiled.sample(tuple(self._waiting), (*self._highest, *self._lowest))
-            self._waiting.clear()
+        waiting, self._waiting = self._waiting, []
+        if waiting:
+            _compiled.sample(tuple(waiting), (*self._highest, *self._lowest))
 
     def _add(self, gray: Int16) -> None:
         for start in range(0, len(gray), _ROWS):
@@ -313,7 +320,14 @@ class RobustPlates:
         self._waiting: list[Keyed] = []
 
     def add(self, frame: Keyed) -> None:
-        """Take in one frame, which is not to change; frames come in the order of the take."""
+        """Take in one frame, which is not to change until `measured` is asked for: up to eight
+        frames wait, or 64 MB of them. Frames come in the order of the take.
+
+        Raises:
+            ValueError: it is of another size.
+        """
+        if frame.gray.shape != self._count.shape:
+            raise ValueError(f"a frame of {frame.gray.shape} among frames of {self._count.shape}")
         if _compiled is None:
             self._add(frame)
             return
@@ -322,10 +336,11 @@ class RobustPlates:
             self._take_in()
 
     def _take_in(self) -> None:
-        if not self._waiting:
+        waiting, self._waiting = self._waiting, []
+        if not waiting:
             return
         _compiled.add(
-            tuple(part for frame in self._waiting for part in (frame.keys, frame.gray)),
+            tuple(part for frame in waiting for part in (frame.keys, frame.gray)),
             (
                 *(self._lit_low, self._lit_high, self._dark),
                 *(self._shaded_low, self._shaded_high, self._deep),
@@ -335,7 +350,6 @@ class RobustPlates:
             (*self._lowest.parts, *self._next.parts),
             _LEAST_GROUP,
         )
-        self._waiting.clear()
 
     def _add(self, frame: Keyed) -> None:
         founding = []

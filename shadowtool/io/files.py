@@ -29,6 +29,8 @@ _SAMPLE, _SAMPLES = 1 << 16, 256
 _FOLD = 4099
 # Bytes that are read at a time, a multiple of the fold's.
 _BLOCK = 8 * 32 * _FOLD
+# So many buffers a thread keeps: a frame's, and what goes with it.
+_SPARES = 3
 _counter = itertools.count()
 
 
@@ -83,11 +85,33 @@ def _known_as(path: Path, version: _Version) -> tuple[_Version, str]:
 
 
 class _Spare(threading.local):
-    """Memory that the thread has read files into, and may again: new memory takes as long as
-    reading does."""
+    """Memory that one of a pool's threads has read files into, and may again: new memory takes as
+    long as reading does."""
 
     def __init__(self) -> None:
-        self.buffers: list[bytearray] = []
+        self._buffers: list[bytearray] = []
+
+    def take(self, size: int) -> bytearray:
+        """Memory of so many bytes."""
+        for place in reversed(range(len(self._buffers))):
+            # What shrinks to less than half goes back to the system, and what grows is copied.
+            if size <= 2 * len(self._buffers[place]) <= 4 * size:
+                buffer = self._buffers.pop(place)
+                # It is left to whoever still looks at what was in it: its size can't be changed.
+                with contextlib.suppress(BufferError):
+                    buffer.extend(bytes(max(size + 1 - len(buffer), 0)))
+                    del buffer[size:]
+                    return buffer
+        # With some more: files of a take differ a little in size.
+        buffer = bytearray(size + size // 8 + 1)
+        del buffer[size:]
+        return buffer
+
+    def give(self, buffer: bytearray) -> None:
+        """What nobody looks at any more. A few are kept, but for the main thread, which goes on
+        when it has read all that it needs."""
+        if threading.current_thread() is not threading.main_thread():
+            self._buffers = [*self._buffers[1 - _SPARES :], buffer]
 
 
 _spare = _Spare()
@@ -101,25 +125,28 @@ class File:
     """
 
     def __init__(self, path: Path, mark: str | None) -> None:
-        self._path, self._mark = path, mark
+        self._path, self._mark, self._closed = path, mark, False
 
     @cached_property
     def content(self) -> bytearray:
-        """All of it, as long as the file is being read; the next one may overwrite it."""
+        """All of it, until the file is no longer being read; then the next one may overwrite it."""
+        assert not self._closed
         with _reading(self._path), io.FileIO(self._path) as file:
-            buffer = _buffer(os.fstat(file.fileno()).st_size)
+            buffer = _spare.take(os.fstat(file.fileno()).st_size)
             filled = 0
             with memoryview(buffer) as whole:
                 while count := file.readinto(whole[filled:]):
                     filled += count
-            # It is shorter, or longer, only where it changed.
             del buffer[filled:]
+            # Not all file systems tell the size.
+            buffer += file.readall()
             return buffer
 
     def close(self) -> None:
         """Nobody looks at the content any more."""
+        self._closed = True
         if "content" in self.__dict__:
-            _spare.buffers.append(self.__dict__.pop("content"))
+            _spare.give(self.__dict__.pop("content"))
 
     @cached_property
     def source(self) -> str | BinaryIO:
@@ -156,21 +183,6 @@ def unchanging(path: Path) -> Iterator[File]:
         file.close()
     if _version(path) != version:
         raise _changed(path)
-
-
-def _buffer(size: int) -> bytearray:
-    """Memory of so many bytes, that the thread had before if it may be."""
-    while _spare.buffers:
-        buffer = _spare.buffers.pop()
-        # It is lost to whoever still looks at what was in it: then no size can be changed.
-        with contextlib.suppress(BufferError):
-            buffer.extend(bytes(max(size + 1 - len(buffer), 0)))
-            del buffer[size:]
-            return buffer
-    # With some more: files of a take differ a little in size.
-    buffer = bytearray(size + size // 8 + 1)
-    del buffer[size:]
-    return buffer
 
 
 def read_content(path: Path) -> Content:

@@ -450,7 +450,7 @@ class _Take:
         """Each frame in turn, None for those that are skipped.
 
         Args:
-            last: it is the last reading: holdouts are written, and no frame stays in memory.
+            last: it is the last reading: holdouts are written, and no frame is kept any longer.
         """
 
         def read(frame: Frame) -> _Shown | None:

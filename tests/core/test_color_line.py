@@ -127,9 +127,17 @@ compiled = pytest.mark.skipif(color_line._compiled is None, reason="installed wi
 
 
 @compiled
-@given(st.integers(0, 700), st.integers(0, 2**32 - 1), st.booleans())
-def test_compiled_or_not_the_same_distances_are_found(count: int, seed: int, few: bool) -> None:
-    """Colours on the line, off it, beyond its ends, and of nothing and anything."""
+@given(
+    st.integers(0, 700),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([slice(None), slice(1, -1), slice(None, None, 2), slice(None, None, -1)]),
+    st.booleans(),
+)
+def test_compiled_or_not_the_same_distances_are_found(
+    count: int, seed: int, some: slice, columns: bool
+) -> None:
+    """Colours on the line, off it, beyond its ends, and of nothing and anything; lines of no length
+    and next to none; colours that don't follow each other."""
     rng = np.random.default_rng(seed)
     lit = rng.uniform(0.01, 1, (3, count)).astype(np.float32)
     shadow = lit * rng.uniform(0, 1.1, (3, 1)).astype(np.float32)
@@ -138,11 +146,13 @@ def test_compiled_or_not_the_same_distances_are_found(count: int, seed: int, few
     for values in (lit, shadow, colours):
         strange = rng.random(values.shape) < 0.03
         values[strange] = rng.choice([0, -1, 1e30, np.nan, np.inf, -np.inf], strange.sum())
+    short = rng.random(count) < 0.1
+    shadow[:, short] = lit[:, short] * rng.choice([1, 1 - 1e-6, 1 - 1e-4], short.sum())
     with np.errstate(all="ignore"):
-        weighed = Weighed(colours, CAMERA, 0.02)
-    if few:
-        # Rows that don't follow each other.
-        weighed, lit, shadow = weighed.part(slice(1, -1)), lit[:, 1:-1], shadow[:, 1:-1]
+        weighed = Weighed(colours, CAMERA, 0.02).part(some)
+    lit, shadow = lit[:, some], shadow[:, some]
+    if columns:
+        lit, shadow = np.asfortranarray(lit), np.asfortranarray(shadow)
     found = weighed.nearest(lit, shadow)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(color_line, "_compiled", None)
@@ -164,3 +174,15 @@ def test_colours_and_lines_that_do_not_fit_together_are_not_compared(wrong: dict
     nearest()
     with pytest.raises(ValueError):
         nearest(**wrong)
+
+
+@compiled
+@pytest.mark.parametrize("apart", [slice(None, None, 2), slice(None, None, -1)])
+def test_colours_that_do_not_follow_each_other_are_not_compared(apart: slice) -> None:
+    whole, part = np.ones((3, 5), "f4"), np.ones((3, 10), "f4")[:, apart][:, :5]
+    out = np.empty(5, "f4")
+    for place in range(4):
+        parts = [whole] * 4
+        parts[place] = part
+        with pytest.raises(ValueError, match="three channels"):
+            color_line._compiled.nearest(*parts, out, out.copy())

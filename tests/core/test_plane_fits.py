@@ -432,6 +432,29 @@ def test_where_few_errors_of_nothing_lead_predictions_are_numbers(
 
 
 @pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("twin", [pytest.param(True, marks=compiled), False])
+@pytest.mark.parametrize("rounded", [(1e-13, 0), (0, 1e-13), (1e-13, 1e-13), (-1e-13, 1e-13)])
+def test_slopes_of_a_single_place_are_as_well_known_as_what_holds_them_back(
+    twin: bool, rounded: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of whose weights rounding leaves less than nothing about their mean."""
+    weight, x, y, value = 6e9, 31.0, -37.0, 1050.0
+    less_x, less_y = rounded
+    sums = [weight, weight * x, weight * y]
+    sums += [weight * x * x * (1 - less_x), weight * x * y, weight * y * y * (1 - less_y)]
+    sums += [weight * value * power for power in (1, x, y, value)] + [4.0]
+    if not twin:
+        monkeypatch.setattr(plane_fits, "_compiled", None)
+    planes = plane_fits._Planes(*(np.empty((1, 1), np.float32) for _ in range(9)))
+    arrays = [np.full((1, 1), part) for part in sums]
+    plane_fits._solve(arrays, 1.0, 10, slice(None), planes)
+    # A slope of one a pixel, ten pixels to a radius.
+    most = 10 / np.sqrt(0.1) * (1 + 1e-3)
+    assert 0 < planes.px[0, 0] <= most and 0 < planes.qy[0, 0] <= most
+    assert all(np.isfinite(part).all() for part in planes)
+
+
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("columns", "factor"), [(2, 4.8), (3, 2.7), (4, 7.2), (9, 1.6), (31, 5.5), (78, 6.7)]
 )

@@ -365,21 +365,55 @@ def peak(add: Callable[[], None], frames: int) -> int:
 
 
 def test_memory_does_not_grow_with_the_frames() -> None:
-    lit, shaded = keyed(SCENE.lit), keyed(SCENE.shadow)
     levels = SampledLevels(*SHAPE)
-    levels.add(lit.gray)
+    levels.add(keyed(SCENE.lit).gray)
     plates = RobustPlates(levels.levels(), NOISE)
 
     def add() -> None:
-        levels.add(lit.gray)
-        plates.add(lit)
-        plates.add(shaded)
+        for image in (SCENE.lit, SCENE.shadow):
+            frame = keyed(image.copy())
+            levels.add(frame.gray)
+            plates.add(frame)
 
     add()
     tracemalloc.start()
-    few, many = peak(add, 2), peak(add, 200)
+    few, many = peak(add, 10), peak(add, 200)
     tracemalloc.stop()
     assert many < few + SCENE.lit.nbytes
+
+
+@pytest.mark.skipif(robust_plates._compiled is None, reason="installed without a compiler")
+@pytest.mark.parametrize(("bytes_each", "most"), [(1, 8), (3, 3), (5, 2), (9, 1), (100, 1)])
+def test_no_more_frames_wait_than_there_is_room_for(
+    bytes_each: int, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = keyed(SCENE.lit)
+    size = frame.keys.nbytes + frame.gray.nbytes
+    monkeypatch.setattr(robust_plates, "_WAITING", 10 * size // bytes_each)
+    levels = SampledLevels(*SHAPE)
+    levels.add(frame.gray)
+    plates = RobustPlates(levels.levels(), NOISE)
+    waiting = []
+    for _ in range(20):
+        plates.add(frame)
+        waiting.append(len(plates._waiting))
+    # The last of them is taken in at once with those that waited.
+    assert max(waiting) == most - 1
+    assert plates.measured().lit_frames.max() == 20
+
+
+def test_a_frame_of_another_size_is_refused_and_changes_nothing() -> None:
+    levels = SampledLevels(4, 6)
+    lit = keyed(np.full((4, 6, 3), 0.5, np.float16))
+    turned = keyed(np.full((6, 4, 3), 0.5, np.float16))
+    levels.add(lit.gray)
+    with pytest.raises(ValueError, match="among frames of"):
+        levels.add(turned.gray)
+    plates = RobustPlates(levels.levels(), NOISE)
+    plates.add(lit)
+    with pytest.raises(ValueError, match="among frames of"):
+        plates.add(turned)
+    assert (plates.measured().lit_frames == 1).all()
 
 
 def any_take(seed: int, negative: bool) -> tuple[list[np.ndarray], Holdouts]:

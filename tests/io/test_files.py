@@ -1,5 +1,6 @@
 """Files appear whole or not at all."""
 
+import contextlib
 import errno
 import fcntl
 import io
@@ -10,12 +11,14 @@ import subprocess
 import sys
 import threading
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from shadowtool.errors import InputError, RetryError, ShadowtoolError
+from shadowtool.io import files as files_module
 from shadowtool.io.files import (
     fingerprint,
     fingerprint_file,
@@ -320,28 +323,96 @@ def test_a_file_is_read_once_or_decoded_by_its_name(tmp_path):
         assert (file.content, file.fingerprint()) == (b"first", fingerprint(b"first"))
 
 
+def in_thread(work):
+    """What work gives in a thread of a pool, which keeps what it has read into."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(work).result()
+
+
+def files(folder, *sizes):
+    paths = [folder / str(number) for number in range(len(sizes))]
+    for number, (path, size) in enumerate(zip(paths, sizes, strict=True)):
+        path.write_bytes(bytes([number + 1]) * size)
+    return paths
+
+
 def test_each_file_that_is_being_read_has_a_content_of_its_own(tmp_path):
-    paths = [tmp_path / name for name in "abc"]
-    contents = [b"a" * 5000, b"bb", b"c" * 9000]
-    for path, content in zip(paths, contents, strict=True):
-        path.write_bytes(content)
-    for _ in range(2):
-        with unchanging(paths[0]) as one, unchanging(paths[1]) as other:
-            assert (bytes(one.content), bytes(other.content)) == (contents[0], contents[1])
-            with unchanging(paths[2]) as third:
-                assert bytes(third.content) == contents[2]
-            assert (bytes(one.content), bytes(other.content)) == (contents[0], contents[1])
+    paths = files(tmp_path, 5000, 2, 9000)
+
+    def read():
+        for _ in range(2):
+            with unchanging(paths[0]) as one, unchanging(paths[1]) as other:
+                assert (bytes(one.content), bytes(other.content)) == (b"\1" * 5000, b"\2\2")
+                with unchanging(paths[2]) as third:
+                    assert bytes(third.content) == b"\3" * 9000
+                assert (bytes(one.content), bytes(other.content)) == (b"\1" * 5000, b"\2\2")
+
+    in_thread(read)
+
+
+@pytest.mark.parametrize("failing", [False, True])
+def test_what_is_read_goes_where_the_last_file_was_that_was_about_as_large(failing, tmp_path):
+    paths = files(tmp_path, 10_000, 20, 11_000, 6_000, 30)
+
+    def read(path):
+        with contextlib.suppress(InputError), unchanging(path) as file:
+            read = file.content
+            assert len(read) == path.stat().st_size
+            if failing:
+                raise InputError("damaged")
+        return read
+
+    large, small, *others, last = in_thread(lambda: [read(path) for path in paths])
+    assert all(other is large for other in others)
+    assert small is last and small is not large
+
+
+def test_the_main_thread_keeps_nothing_that_it_has_read(tmp_path):
+    (path,) = files(tmp_path, 1000)
+
+    def kept():
+        with unchanging(path) as file:
+            assert file.content
+        return len(files_module._spare._buffers)
+
+    assert kept() == 0
+    assert in_thread(kept) == 1
 
 
 def test_what_is_still_looked_at_is_not_overwritten(tmp_path):
-    one, other = tmp_path / "a", tmp_path / "b"
-    one.write_bytes(b"1" * 100)
-    other.write_bytes(b"2" * 100)
-    with unchanging(one) as file:
-        view = memoryview(file.content)
-    with unchanging(other) as file:
-        assert bytes(file.content) == b"2" * 100
-    assert bytes(view) == b"1" * 100
+    one, other = files(tmp_path, 100, 100)
+
+    def read():
+        with unchanging(one) as file:
+            view = memoryview(file.content)
+        with unchanging(other) as file:
+            assert bytes(file.content) == b"\2" * 100
+        return bytes(view)
+
+    assert in_thread(read) == b"\1" * 100
+
+
+def test_a_file_is_read_in_as_many_pieces_as_it_comes_in(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    path.write_bytes(bytes(range(256)))
+
+    class Slow(io.FileIO):
+        def readinto(self, buffer):
+            return super().readinto(memoryview(buffer)[:100])
+
+    monkeypatch.setattr(files_module.io, "FileIO", Slow)
+    with unchanging(path) as file:
+        assert bytes(file.content) == bytes(range(256))
+
+
+@pytest.mark.parametrize("told", [0, 100, 255, 257, 1000])
+def test_a_file_whose_size_is_told_wrong_is_read_whole(told, tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    path.write_bytes(bytes(range(256)))
+    taken = files_module._Spare.take
+    monkeypatch.setattr(files_module._Spare, "take", lambda self, size: taken(self, told))
+    with unchanging(path) as file:
+        assert bytes(file.content) == bytes(range(256))
 
 
 @pytest.mark.parametrize("replaced", [True, False])

@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
@@ -193,11 +194,13 @@ def _keep_memory() -> None:
 
 
 def _silence_libraries() -> None:
-    """Keep what C libraries print to stdout and stderr from getting between our lines.
+    """Keep what libraries print to stdout and stderr from getting between our lines.
 
-    OpenEXR writes a warning to stdout for a damaged file, which is then reported by us; stdout
-    holds only results. ``-v`` leaves everything as it is.
+    OpenEXR writes a warning to stdout for a damaged file, which is then reported by us; numpy
+    writes one to stderr for light that is too bright for a float, whose pixels are unknown or
+    counted in the end. stdout holds only results. ``-v`` leaves everything as it is.
     """
+    warnings.simplefilter("ignore", RuntimeWarning)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for name, number in (("stdout", 1), ("stderr", 2)):
         try:

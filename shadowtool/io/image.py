@@ -7,6 +7,7 @@ function.
 import contextlib
 import io
 import logging
+import re
 import struct
 import threading
 import zlib
@@ -37,6 +38,8 @@ from shadowtool.io.files import (
 from shadowtool.io.openexr_core import set_zip_level
 
 logger = logging.getLogger(__name__)
+_said: set[tuple[Path, str]] = set()
+_saying = threading.Lock()
 
 Float32 = NDArray[np.float32]
 
@@ -213,8 +216,18 @@ class Image:
                 f"{self.path}: has no R, G, B, only {', '.join(self.layers)};"
                 " write the wanted layer as R, G, B first"
             )
-        logger.warning("%s: no R, G, B; the layer %s is taken", self.path, colours[0])
+        _say_once(self.path, f"no R, G, B; the layer {colours[0]} is taken")
         return colours[0]
+
+
+def _say_once(path: Path, message: str) -> None:
+    """Warn of what is most likely the same in all frames of a sequence once for all of them."""
+    frames = path.with_name(re.sub(r"\d(?=\d*\.[^.]*$)", "#", path.name))
+    with _saying:
+        known = (frames, message) in _said
+        _said.add((frames, message))
+    if not known:
+        logger.warning("%s: %s", frames, message)
 
 
 def resolve_transfer(transfer: str, path: Path) -> str:
@@ -629,7 +642,7 @@ def _channels(
     if len(file.parts) != len(listed.parts):
         raise DamagedFileError(f"{path}: damaged or cut off; write the frame again")
     if len(file.parts) > 1:
-        logger.warning("%s: of %d parts the first is taken", path, len(file.parts))
+        _say_once(path, f"of {len(file.parts)} parts the first is taken")
     return {name: channel.pixels for name, channel in file.channels(0).items()}
 
 

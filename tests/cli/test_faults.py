@@ -865,6 +865,27 @@ def test_stdout_stays_clean_when_openexr_prints_a_warning(shot, copied, tmp_path
     assert re.fullmatch(r"shadowtool: skipped: .*1003\.exr: damaged or cut off.*\n", done.stderr)
 
 
+@pytest.mark.parametrize("values", [[3e38, -3e38], [1e30, 7e4], [np.inf, np.nan, -np.inf]])
+def test_light_beyond_all_measure_is_no_reason_for_numpy_to_speak(values, shot, tmp_path):
+    rng = np.random.default_rng(0)
+    take = tmp_path / "take"
+    take.mkdir()
+    for file in sorted(shot.photometric.glob("*.exr")):
+        image = read_image(file).rgb().astype(np.float32)
+        strange = rng.random(image.shape[:2]) < 0.05
+        image[strange] = rng.choice(values, (strange.sum(), 1))
+        write_exr(take / file.name, {"RGB": image})
+    steps = [
+        ["plate", take, "-o", tmp_path / "plates"],
+        ["plate", take, "-o", tmp_path / "extremes", "--estimator", "minmax"],
+        ["matte", take, "--plates", shot.plates, "-o", tmp_path / "mattes"],
+        ["scan", take, *shot.arguments("scan")[2:], "-o", tmp_path / "scan"],
+    ]
+    for words in steps:
+        said = run(*words).stderr.splitlines()
+        assert all(line.startswith("shadowtool: ") for line in said)
+
+
 def test_the_program_answers_help_and_version():
     assert "Usage" in run("--help").stdout
     assert run("--version").stdout.startswith("shadowtool, version ")

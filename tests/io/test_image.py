@@ -664,6 +664,22 @@ def test_a_layer_is_taken_when_there_is_no_plain_colour_and_said_so(tmp_path, ca
     assert "the layer diffuse is taken" in caplog.text
 
 
+@pytest.mark.parametrize("what", ["layer", "part"])
+def test_what_is_taken_of_all_frames_is_said_once(what, tmp_path, caplog):
+    paths = [tmp_path / f"shot2.{number:04}.exr" for number in range(95, 105)]
+    for path in paths:
+        if what == "part":
+            multi_part(path)
+        else:
+            layers = {f"diffuse.{c}": random(4, 5) for c in "RGB"} | {"Z": random(4, 5)}
+            raw_exr(path, layers)
+    with ThreadPoolExecutor(4) as pool:
+        for image in pool.map(read_image, paths):
+            image.rgb()
+    (record,) = caplog.records
+    assert record.getMessage().startswith(f"{tmp_path / 'shot2.####.exr'}: ")
+
+
 def test_two_layers_without_plain_colour_are_refused_with_both_named(tmp_path):
     channels = {f"{layer}.{c}": random(4, 5) for layer in ("diffuse", "specular") for c in "RGB"}
     image = read_image(raw_exr(tmp_path / "a.exr", channels))

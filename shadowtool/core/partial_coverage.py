@@ -169,7 +169,8 @@ def complete_shadow(
     missed = np.zeros_like(dark)
     if not partial:
         missed = _missed_by_the_card(lit, seen, dark, expected)
-    common = np.log(channel_sum(expected) / 3)
+    with np.errstate(divide="ignore"):
+        common = np.log(channel_sum(expected) / 3)
     above = usual - common > spread
     gray -= common
     with np.errstate(invalid="ignore"):

@@ -53,6 +53,8 @@ _GRAINY = (
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
 )
+# Names that no layer has.
+_CHANNELS = frozenset("RGBAXYZ")
 # Of a grey picture R, G and B differ by no more than this, which rounding explains.
 _COLOURED = 1 / 32
 # ZIP levels: what OpenEXR takes by itself, and the least that compresses.
@@ -387,8 +389,8 @@ def write_exr(
     """Write a scanline EXR with ZIP compression, whole or not at all.
 
     Args:
-        channels: arrays by name, (H, W), or (H, W, 3) and (H, W, 4) under "RGB" and "RGBA";
-            float16 or float32.
+        channels: arrays by name, (H, W), or (H, W, 3) and (H, W, 4) under "RGB" and "RGBA", or
+            under the name of a layer that has these; float16 or float32.
         header: where display window's origin, pixel aspect, frame rate and time code come from.
         provenance: how the file was made; becomes string attributes.
         quick: search less for what repeats. A picture with grain takes half the time and up to
@@ -415,15 +417,20 @@ def encode_exr(
     Raises:
         RetryError: there is no memory for it.
     """
-    arrays = {}
+    arrays: dict[str, NDArray[Any]] = {}
     height, width = next(iter(channels.values())).shape[:2]
     for name, values in channels.items():
         if values.dtype not in (np.float16, np.float32):
             raise TypeError(f"channel {name} of {path} is {values.dtype}, not half or float")
-        together = (len(name),) if name in ("RGB", "RGBA") else ()
-        if values.shape not in ((height, width), (height, width, *together)):
+        plain = name in ("RGB", "RGBA")
+        together = (len(name),) if plain else () if name in _CHANNELS else (3, 4)
+        if values.shape not in [(height, width), *((height, width, own) for own in together)]:
             raise TypeError(f"channel {name} of {path} is of another shape, {values.shape}")
-        arrays[name] = np.ascontiguousarray(values)
+        own = {name: values}
+        if values.ndim == 3 and not plain:
+            letters = enumerate("RGBA"[: values.shape[2]])
+            own = {f"{name}.{letter}": values[..., index] for index, letter in letters}
+        arrays |= {key: np.ascontiguousarray(value) for key, value in own.items()}
     first = np.array((0, 0) if header is None else header.origin, np.int32)
     window = first, first + np.array([width - 1, height - 1], np.int32)
     attributes: dict[str, Any] = {

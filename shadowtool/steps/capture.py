@@ -4,6 +4,7 @@ import itertools
 import logging
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from shadowtool.steps.run import (
     Run,
     current,
     name_of_frames,
+    or_missing,
     refuse_existing,
     refuse_other_format,
     refuse_other_step,
@@ -270,25 +272,22 @@ class _Taking:
         first = self.source.earliest()
         reference = None if first is None else self._prepared(self._linear(first.values))
 
-        def work(arriving: Arriving) -> _Measured | Frame:
-            try:
-                return self._write(arriving, reference)
-            except MissingError as error:
-                if self.run.missing == "error":
-                    raise
-                say_skipped(error)
-                return arriving.frame
+        write = or_missing(partial(self._write, reference=reference), self.run)
+
+        def work(arriving: Arriving) -> tuple[Frame, _Measured | MissingError]:
+            return arriving.frame, write(arriving)
 
         total = self.source.total
         self.run.progress(0, total)
-        for number, done in enumerate(
+        for number, (frame, done) in enumerate(
             ordered_map(work, self.source.arriving, self.run.jobs), start=1
         ):
-            if isinstance(done, _Measured):
-                frames.append(done.frame)
-                report.add(done)
+            if isinstance(done, MissingError):
+                say_skipped(done)
+                skipped.append(frame)
             else:
-                skipped.append(done)
+                frames.append(frame)
+                report.add(done)
             self.run.progress(number, max(total, number) if total else 0)
         if frames:
             self.run.progress(len(frames), len(frames))

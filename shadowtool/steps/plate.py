@@ -1,5 +1,6 @@
 """Lit and shadow plates from a take in which a shadow moves over the scene."""
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -69,6 +70,7 @@ from shadowtool.steps.run import (
     Result,
     Run,
     left_out,
+    or_missing,
     refuse_existing,
     refuse_inputs,
     refuse_other_step,
@@ -192,13 +194,15 @@ def plate(
         else:
             region = None if marked is None else marked.region
             estimate = _robust(take, frames, automatic, region)
+        missed = not_finite(estimate.lit)
+        unseen = 0 if missed is None else int(np.count_nonzero(missed))
+        pixels = estimate.lit.shape[0] * estimate.lit.shape[1]
+        if unseen == pixels:
+            why = _nothing_seen(take)
+            take.remove_holdouts()
+            raise InputError(why)
     if len(take.used) < 2:
         logger.warning("%s: one frame shows no moving shadow", footage.sequence.pattern)
-    missed = not_finite(estimate.lit)
-    unseen = 0 if missed is None else int(np.count_nonzero(missed))
-    pixels = estimate.lit.shape[0] * estimate.lit.shape[1]
-    if unseen == pixels:
-        raise InputError(_nothing_seen(take))
     warn_of_nan(output, take.not_finite)
     if unseen:
         part = 100 * unseen / pixels
@@ -453,37 +457,30 @@ class _Take:
             last: it is the last reading: holdouts are written, and no frame is kept any longer.
         """
 
-        def read(frame: Frame) -> _Shown | None:
-            try:
-                if frame in self.kept:
-                    values, grid, mark, place = self.kept.pop(frame) if last else self.kept[frame]
-                else:
-                    image = self.footage.image(frame)
-                    values, place = self.footage.light(image)
-                    mark = image.fingerprint
-                    needed = not last or self.reference is not None or self.background is not None
-                    grid = self.grid(values) if needed else _NO_GRID
-                gain = self.gain(frame, grid)
-                if not is_one(gain):
-                    values = without_gain(values, gain)
-                    grid = self.grid(values)
-                marks = [mark]
-                holdout: NDArray[np.number] | None = None
-                if self.held is not None:
-                    matte = self._given(self.held.path(frame))
-                    marks.append(matte.fingerprint)
-                    holdout = moved_with(matte.plane("A", "Y"), matte.path, matte.header, place)
-                elif self.background is not None:
-                    holdout = self.automatic(frame, grid, last)
-                    if last:
-                        own = self.recipe.provenance(self.recipe.fingerprint([mark]))
-                        write_png(_place(self.folder, frame), holdout, own)
-            except MissingError as error:
-                if self.run.missing == "skip":
-                    if last:
-                        say_skipped(error)
-                    return None
-                raise
+        def read(frame: Frame) -> _Shown:
+            if frame in self.kept:
+                values, grid, mark, place = self.kept.pop(frame) if last else self.kept[frame]
+            else:
+                image = self.footage.image(frame)
+                values, place = self.footage.light(image)
+                mark = image.fingerprint
+                needed = not last or self.reference is not None or self.background is not None
+                grid = self.grid(values) if needed else _NO_GRID
+            gain = self.gain(frame, grid)
+            if not is_one(gain):
+                values = without_gain(values, gain)
+                grid = self.grid(values)
+            marks = [mark]
+            holdout: NDArray[np.number] | None = None
+            if self.held is not None:
+                matte = self._given(self.held.path(frame))
+                marks.append(matte.fingerprint)
+                holdout = moved_with(matte.plane("A", "Y"), matte.path, matte.header, place)
+            elif self.background is not None:
+                holdout = self.automatic(frame, grid, last)
+                if last:
+                    own = self.recipe.provenance(self.recipe.fingerprint([mark]))
+                    write_png(_place(self.folder, frame), holdout, own)
             keys = keyed(values, holdout) if with_keys else None
             if keys is not None:
                 # What nobody asks for any more must not wait in memory.
@@ -493,7 +490,13 @@ class _Take:
                     keys = keys._replace(keys=_NOTHING.view(np.int16))
             return _Shown(values, grid, holdout, keys, marks, gain, place)
 
-        yield from ordered_map(read, frames, self.run.jobs)
+        for item in ordered_map(or_missing(read, self.run), frames, self.run.jobs):
+            if isinstance(item, MissingError):
+                if last:
+                    say_skipped(item)
+                yield None
+            else:
+                yield item
 
     def automatic(self, frame: Frame, grid: NDArray[np.float32], last: bool) -> NDArray[np.uint8]:
         """The automatic holdout, (H, W) uint8, of a frame's pixels on the grid."""
@@ -504,6 +507,14 @@ class _Take:
         if not last:
             self.masks[frame] = mask
         return full_size(mask, *self.footage.header.size, self.step)
+
+    def remove_holdouts(self) -> None:
+        """Remove what the last reading wrote, which is of no use."""
+        if self.background is not None:
+            for frame in self.used:
+                _place(self.folder, frame).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                self.folder.rmdir()
 
     def all_shown(
         self, frames: list[Frame], with_keys: bool, begun: int

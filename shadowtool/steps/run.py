@@ -6,8 +6,9 @@ import logging
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from shadowtool import __version__
 from shadowtool.choices import Missing
@@ -19,6 +20,9 @@ from shadowtool.io.sequence import Frame, frame_number, frame_range, parse_frame
 from shadowtool.parallel import ordered_map
 
 logger = logging.getLogger(__name__)
+
+Item = TypeVar("Item")
+Made = TypeVar("Made")
 
 # Flags that are on unless they are switched off by a --no- of their own.
 _SWITCHES = {"clamp"}
@@ -209,9 +213,11 @@ class FrameWork:
         skipped, kept = list(absent), 0
         with new_folders([self.output, *sorted(folders)], shared=run.frames is not None):
             run.progress(0, len(frames))
-            results = ordered_map(lambda frame: self._frame(frame, run), frames, run.jobs)
+            make = or_missing(partial(self._frame, run=run), run)
+            results = ordered_map(make, frames, run.jobs)
             for number, (frame, outcome) in enumerate(zip(frames, results, strict=True), start=1):
-                if outcome is None:
+                if isinstance(outcome, MissingError):
+                    say_skipped(outcome)
                     skipped.append(frame)
                 else:
                     rows[str(frame)] = outcome[0]
@@ -225,22 +231,16 @@ class FrameWork:
         done = [frame for frame in frames if str(frame) in rows]
         return Result(self.recipe.step, self.output, done, kept, skipped, figures)
 
-    def _frame(self, frame: Frame, run: Run) -> tuple[Figures, bool] | None:
-        try:
-            sources = self.sources(frame)
-            refuse_inputs(self.products(frame), sources)
-            with fingerprinted(sources) as inputs:
-                mark = self.recipe.fingerprint([*self.shared, *inputs])
-                read = sum(map(size_of, sources))
-                if run.resume and (figures := current(self.products(frame), mark)) is not None:
-                    return {"fingerprint": mark, "read": read, **figures}, True
-                figures = self.make(frame, self.recipe.provenance(mark))
-                return {"fingerprint": mark, "read": read, **figures}, False
-        except MissingError as error:
-            if run.missing == "skip":
-                say_skipped(error)
-                return None
-            raise
+    def _frame(self, frame: Frame, run: Run) -> tuple[Figures, bool]:
+        sources = self.sources(frame)
+        refuse_inputs(self.products(frame), sources)
+        with fingerprinted(sources) as inputs:
+            mark = self.recipe.fingerprint([*self.shared, *inputs])
+            read = sum(map(size_of, sources))
+            if run.resume and (figures := current(self.products(frame), mark)) is not None:
+                return {"fingerprint": mark, "read": read, **figures}, True
+            figures = self.make(frame, self.recipe.provenance(mark))
+            return {"fingerprint": mark, "read": read, **figures}, False
 
     def _record(
         self, rows: dict[str, Figures], summary: Callable[[list[Figures]], Figures]
@@ -316,6 +316,21 @@ def refuse_inputs(products: Iterable[Path], sources: Iterable[Path]) -> None:
         for source in read.get(file.name, ()):
             if is_file(file) and is_file(source) and file.samefile(source):
                 raise OptionError(f"{file}: is to be read, not written over; give another -o")
+
+
+def or_missing(work: Callable[[Item], Made], run: Run) -> Callable[[Item], Made | MissingError]:
+    """``work`` that gives the error, instead of raising it, for what is missing and may be; it is
+    for `say_skipped`, in the order of the frames."""
+
+    def attempt(item: Item) -> Made | MissingError:
+        try:
+            return work(item)
+        except MissingError as error:
+            if run.missing == "error":
+                raise
+            return error
+
+    return attempt
 
 
 def say_skipped(error: MissingError) -> None:

@@ -61,6 +61,7 @@ from shadowtool.steps.run import (
     Result,
     Run,
     left_out,
+    or_missing,
     refuse_existing,
     refuse_inputs,
     refuse_other_step,
@@ -282,15 +283,6 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
     steady = footage.vantage is None
     every = thinning(footage.header.height, footage.header.width) if steady else 1
 
-    def read(position: int) -> _Seen | None:
-        try:
-            return seen(position)
-        except MissingError as error:
-            if run.missing == "skip":
-                say_skipped(error)
-                return None
-            raise
-
     def seen(position: int) -> _Seen:
         sampled, first = position in samples.values(), position == 0
         kept = _Colours(footage.header, every, first) if sampled or first else None
@@ -313,8 +305,11 @@ def _crossings(footage: Footage, frames: list[Frame], gain: Gain, run: Run) -> _
     first: UInt8 | None = None
     sampled = []
     run.progress(0, len(frames))
-    for position, item in enumerate(ordered_map(read, range(len(frames)), run.jobs)):
-        if item is not None:
+    looked_at = ordered_map(or_missing(seen, run), range(len(frames)), run.jobs)
+    for position, item in enumerate(looked_at):
+        if isinstance(item, MissingError):
+            say_skipped(item)
+        else:
             gray, areas, sample, picture, mark = item
             first = first if picture is None else picture
             own = exposure.add(areas) if gain == "auto" else 1.0

@@ -886,6 +886,32 @@ def test_light_beyond_all_measure_is_no_reason_for_numpy_to_speak(values, shot, 
         assert all(line.startswith("shadowtool: ") for line in said)
 
 
+@pytest.mark.parametrize("name", ["plate", "matte", "scan", "capture"])
+def test_what_is_skipped_is_said_in_the_order_of_the_frames(name, shot, tmp_path):
+    words = shot.arguments(name)
+    folder = tmp_path / "many"
+    folder.mkdir()
+    taken = sorted(Path(words[1]).glob("*.exr"))
+    for number in range(40):
+        file = folder / f"many.{number:04}.exr"
+        file.write_bytes(b"" if number % 3 == 2 else taken[number % len(taken)].read_bytes())
+    words[1] = str(folder)
+    said = run(*words, "-o", tmp_path / "out", "--missing", "skip", "-j4").stderr
+    skipped = re.findall(r"skipped: .*many\.(\d+)\.exr", said)
+    assert [int(number) for number in skipped] == list(range(2, 40, 3))
+
+
+def test_footage_of_which_nothing_is_seen_leaves_no_folder(shot, tmp_path):
+    take = tmp_path / "take"
+    take.mkdir()
+    for number in range(4):
+        nothing = np.full((6, 8, 3), np.nan, np.float32)
+        write_exr(take / f"take.{number}.exr", {"RGB": nothing})
+    done = run("plate", take, "-o", tmp_path / "out")
+    assert done.returncode == 1 and "every pixel of every frame" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_program_answers_help_and_version():
     assert "Usage" in run("--help").stdout
     assert run("--version").stdout.startswith("shadowtool, version ")

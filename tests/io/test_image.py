@@ -680,6 +680,18 @@ def test_what_is_taken_of_all_frames_is_said_once(what, tmp_path, caplog):
     assert record.getMessage().startswith(f"{tmp_path / 'shot2.####.exr'}: ")
 
 
+def test_layers_are_written_as_they_are_read(tmp_path):
+    layers = {"diffuse": random(4, 5, 3), "glow": random(4, 5, 4), "RGB": random(4, 5, 3)}
+    layers["Z"] = random(4, 5)
+    write_exr(tmp_path / "a.exr", layers)
+    found = read_image(tmp_path / "a.exr").layers
+    assert found.keys() == layers.keys()
+    for name, values in layers.items():
+        np.testing.assert_array_equal(found[name], values)
+    with pytest.raises(TypeError, match="motion"):
+        write_exr(tmp_path / "b.exr", {"motion": random(4, 5, 2)})
+
+
 def test_two_layers_without_plain_colour_are_refused_with_both_named(tmp_path):
     channels = {f"{layer}.{c}": random(4, 5) for layer in ("diffuse", "specular") for c in "RGB"}
     image = read_image(raw_exr(tmp_path / "a.exr", channels))

@@ -33,8 +33,8 @@ static void nearest(const channels_t *colours, const channels_t *weights, const 
         }
     }
     for (Py_ssize_t at = 0; at < count; at++) {
-        /* NaN stays, as it does there. */
-        float least = length[at] < 1e-9f ? 1e-9f : length[at], place = along[at] / least;
+        /* NaN stays. */
+        float span = length[at] < 1e-9f ? 1e-9f : length[at], place = along[at] / span;
         place = place < 0 ? 0 : place;
         place = place > 1 ? 1 : place;
         part[start + at] = place;
@@ -81,9 +81,8 @@ static PyObject *py_nearest(PyObject *module, PyObject *arguments)
         fit = hold_channels(&held, arrays[place], channels + place);
     Py_ssize_t count = fit ? held.views[0].shape[1] : 0;
     for (int place = 0; fit && place < 2; place++) {
-        const Py_buffer *own = hold(&held, found[place], 4, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE);
-        fit = own && own->len == 4 * count;
-        outs[place] = own ? own->buf : NULL;
+        outs[place] = hold_as_many(&held, found[place], 4, 1, PyBUF_WRITABLE, &count);
+        fit = !PyErr_Occurred();
     }
     if (fit) {
         Py_BEGIN_ALLOW_THREADS
@@ -91,8 +90,6 @@ static PyObject *py_nearest(PyObject *module, PyObject *arguments)
             nearest(channels, channels + 1, channels + 2, channels + 3, start,
                     count - start < TOGETHER ? count - start : TOGETHER, outs[0], outs[1]);
         Py_END_ALLOW_THREADS
-    } else if (!PyErr_Occurred()) {
-        PyErr_SetString(PyExc_ValueError, "as many distances as colours are wanted");
     }
     return let_go(&held);
 }

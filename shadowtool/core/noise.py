@@ -12,6 +12,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from shadowtool.core.bands import blocks
 from shadowtool.core.exposure import Gains, row_gains, without_gain
 from shadowtool.core.ordering import ascending
 
@@ -85,13 +86,12 @@ class NoiseModel:
         value: Float32 = np.maximum(image, 0, dtype=np.float32)
         flat = value.reshape(-1)
         variance = np.empty_like(flat)
-        length = min(flat.size, _RUN)
-        whole = flat.size - flat.size % max(length, 1)
-        for part, run in ((slice(whole), length), (slice(whole, None), flat.size - whole)):
-            if run:
-                # Many times faster than along an axis of three.
-                lines = [np.tile(own.astype(np.float32), run // 3) for own in self._lines()]
-                variance[part] = _lower(flat[part].reshape(-1, run), lines).ravel()
+        # Many times faster than along an axis of three.
+        run = min(flat.size, _RUN) // 3
+        lines = [np.tile(own.astype(np.float32), run) for own in self._lines()]
+        for part in blocks(flat.size, _RUN):
+            own = flat[part]
+            variance[part] = _lower(own, [line[: own.size] for line in lines])
         return variance.reshape(value.shape)
 
     def channel_variance(self, value: Float32, channel: int) -> Float32:

@@ -8,7 +8,7 @@ def ascending(values: NDArray[np.float32]) -> NDArray[np.int64]:
     """Places of values from the lowest to the highest along the last axis; of equals the first
     comes first, on any processor.
 
-    Two to ten times as fast as numpy's stable sort of places.
+    Of many values more than twice as fast as numpy's stable sort of places.
 
     Args:
         values: (..., N) float32, finite, N below 2³¹.

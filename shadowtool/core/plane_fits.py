@@ -481,8 +481,8 @@ def _solve(
     planes: _Planes,
 ) -> None:
     """The planes of some rows from the sums over their windows."""
-    terms = (factor**2, radius, _WEIGHT, _LEVEL, _FLOOR**2, _MISFIT)
     if _compiled is not None:
+        terms = (factor**2, radius, _WEIGHT, _LEVEL, _FLOOR**2, _MISFIT)
         _compiled.solve(tuple(sums), tuple(part[rows] for part in planes), *terms)
         return
     w, wx, wy, wxx, wxy, wyy, wv, wvx, wvy, wvv, count = sums

@@ -197,6 +197,7 @@ class Sampled:
 
 
 def _explained(samples: list[Weighed], lit: Float32, ratio: Float32 | np.float32) -> Bool:
+    # Once for all samples.
     lit = np.ascontiguousarray(lit)
     shadow = np.ascontiguousarray(lit * ratio)
     return np.stack([sample.line_distance(lit, shadow) <= _ON_LINE for sample in samples])

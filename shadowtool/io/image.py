@@ -53,8 +53,8 @@ _GRAINY = (
     *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP),
     *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
 )
-# Names that no layer has.
-_CHANNELS = frozenset("RGBAXYZ")
+# Names of several channels together that are in no layer; and names that no layer has.
+_COLOURS, _CHANNELS = ("RGB", "RGBA"), frozenset("RGBAXYZ")
 # Of a grey picture R, G and B differ by no more than this, which rounding explains.
 _COLOURED = 1 / 32
 # ZIP levels: what OpenEXR takes by itself, and the least that compresses.
@@ -278,8 +278,11 @@ def _by_channel(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     for name, values in arrays.items():
         if values.ndim == 2:
             channels[name] = values
-        else:
-            channels |= {letter: values[..., index] for index, letter in enumerate(name)}
+            continue
+        letters = name if name in _COLOURS else [f"{name}.{letter}" for letter in "RGBA"]
+        # A layer may have no alpha.
+        for index, letter in zip(range(values.shape[2]), letters, strict=False):
+            channels[letter] = values[..., index]
     return channels
 
 
@@ -417,20 +420,15 @@ def encode_exr(
     Raises:
         RetryError: there is no memory for it.
     """
-    arrays: dict[str, NDArray[Any]] = {}
+    arrays = {}
     height, width = next(iter(channels.values())).shape[:2]
     for name, values in channels.items():
         if values.dtype not in (np.float16, np.float32):
             raise TypeError(f"channel {name} of {path} is {values.dtype}, not half or float")
-        plain = name in ("RGB", "RGBA")
-        together = (len(name),) if plain else () if name in _CHANNELS else (3, 4)
+        together = (len(name),) if name in _COLOURS else () if name in _CHANNELS else (3, 4)
         if values.shape not in [(height, width), *((height, width, own) for own in together)]:
             raise TypeError(f"channel {name} of {path} is of another shape, {values.shape}")
-        own = {name: values}
-        if values.ndim == 3 and not plain:
-            letters = enumerate("RGBA"[: values.shape[2]])
-            own = {f"{name}.{letter}": values[..., index] for index, letter in letters}
-        arrays |= {key: np.ascontiguousarray(value) for key, value in own.items()}
+        arrays[name] = np.ascontiguousarray(values)
     first = np.array((0, 0) if header is None else header.origin, np.int32)
     window = first, first + np.array([width - 1, height - 1], np.int32)
     attributes: dict[str, Any] = {
